@@ -20,9 +20,7 @@ class PrintCompletion(argparse.Action):
         values: Any,
         option_string: str | None = None,
     ) -> None:
-        """Print the completion script for the shell named ``values`` and raise SystemExit; with
-        status 2 if the package shtab is missing. Called by argparse when it meets the option.
-        """
+        """Print the completion script of a shell and exit; with status 2 without shtab."""
         try:
             import shtab
         except ImportError:

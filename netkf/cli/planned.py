@@ -67,10 +67,8 @@ def has_rounds(options: argparse.Namespace) -> bool:
 
 
 def work_on_study(plan: Plan, part: Part, pool: PoolOptions, options: argparse.Namespace) -> int:
-    """Simulate a part of the runs of each ensemble in a ``pool``; return the exit status, 1 if some
-    are left.
-
-    In a study with rounds other jobs are waited for as long as ``--for`` allows.
+    """Simulate a part of the runs of each ensemble; return the exit status, 1 if some are left.
+    With rounds other jobs are waited for as long as ``--for`` allows.
     """
     from netkf.ensembles.parts import Worker
     from netkf.ensembles.planned_study import PlannedStudy
@@ -103,9 +101,7 @@ def work_on_study(plan: Plan, part: Part, pool: PoolOptions, options: argparse.N
 
 
 def merge_study(plan: Plan, options: argparse.Namespace) -> int:
-    """Finish the study as its command would have done; return its exit status, 1 if runs are
-    missing.
-    """
+    """Finish the study as its command would; return its exit status, 1 if runs are missing."""
     from netkf.ensembles.parts import Worker
     from netkf.ensembles.planned_study import PlannedStudy
     from netkf.ensembles.plans import require_alike
@@ -127,9 +123,7 @@ def merge_study(plan: Plan, options: argparse.Namespace) -> int:
 
 
 def _study_options(plan: Plan, given: argparse.Namespace) -> argparse.Namespace:
-    """Return the options of the command that wrote a plan, for its copy of the scenario, by those
-    ``given`` to work or merge.
-    """
+    """Return the options of the command that wrote a plan, for its copy of the scenario."""
     options: argparse.Namespace = given.parse(plan.arguments)
     if getattr(options, "plan", None) is None:
         rule = "holds a plan of no study"
@@ -145,9 +139,7 @@ def _missing_runs(
     study: PlannedStudy,
     pool_options: PoolOptions | None = None,
 ) -> list[Gap]:
-    """Run a study without what it prints and writes; return the ensembles that it needs, with
-    their missing runs; none if it came to its end.
-    """
+    """Run a study silently; return the ensembles with missing runs, none if it came to its end."""
     from netkf.ensembles.replicas import MissingRunsError
 
     out = getattr(options, "out", None)

@@ -119,9 +119,7 @@ class Interruption:
 
 
 def end_later(status: int, seconds: float, message: str = "") -> None:
-    """Start a thread that after ``seconds`` writes results that wait in memory (LAST_WRITES),
-    prints ``message`` and ends the process.
-    """
+    """Start a thread that later flushes results (LAST_WRITES), prints ``message``, and ends."""
 
     def end() -> None:
         time.sleep(seconds)
@@ -138,11 +136,8 @@ def end_later(status: int, seconds: float, message: str = "") -> None:
 
 
 def end_process(status: int) -> NoReturn:
-    """Call the functions registered with ``atexit``, flush the standard streams, and end the
-    process without waiting for threads.
-
-    ``sys.exit`` would join threads and write to closed streams again; all results are written by
-    now.
+    """Run the functions of ``atexit``, flush the streams and end the process, without waiting for
+    threads, as ``sys.exit`` would.
     """
     end_later(status, EXIT_SECONDS)
     # Nothing is imported here: if the module is missing, no server was started.
@@ -158,11 +153,7 @@ def end_process(status: int) -> NoReturn:
 
 
 def open_missing_streams() -> None:
-    """Open the null device as each standard stream that is closed.
-
-    Otherwise the next files that are opened would get the descriptors 0, 1 and 2, and printed text
-    would be written to them.
-    """
+    """Open the null device as each closed standard stream, whose descriptor files would get."""
     for number, flags in enumerate((os.O_RDONLY, os.O_WRONLY, os.O_WRONLY)):
         try:
             os.fstat(number)
@@ -231,11 +222,7 @@ class SafeStream:
 
 @contextlib.contextmanager
 def safe_streams() -> Iterator[None]:
-    """Replace the standard streams by SafeStreams within the block.
-
-    Standard error is lossy: a command goes on if its notes cannot be written, and stops if its
-    results cannot.
-    """
+    """Use SafeStreams within the block; only standard error may lose what it cannot write."""
     stdout, stderr = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = SafeStream(stdout, lossy=False), SafeStream(stderr, lossy=True)
     try:

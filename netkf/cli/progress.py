@@ -89,9 +89,7 @@ class ProgressLine:
         return update
 
     def make_count_update(self, unit: str) -> Callable[[int, int], None]:
-        """Return a callback for work of many parts: a function of the numbers (done, wanted) that
-        shows both on the line, in ``unit`` ("runs", "points"), and the estimated time left.
-        """
+        """Return a function of (done, wanted) that shows both in ``unit``, and the time left."""
         first_update: tuple[float, int] | None = None
 
         def update(done: int, wanted: int) -> None:

@@ -92,10 +92,8 @@ class FigureSet:
         return ("stability",) if self._sweep is not None else tuple(FIGURES)
 
     def draw(self, name: str, *, omit_slow: bool = False) -> Picture:
-        """Return the figure of this name, or one with the reason why it cannot be drawn; with
-        ``omit_slow`` also with the reason why a figure that takes minutes is left out.
-
-        Raises ScenarioError for an unknown name.
+        """Return the figure, or one with the reason why it cannot be drawn or, with ``omit_slow``,
+        is left out because it takes minutes. Raises ScenarioError for an unknown name.
         """
         if name not in self.names:
             hint = suggest_nearest(name, self.names)
@@ -131,12 +129,9 @@ class FigureSet:
 
 
 def plot_to_files(result: Any, names: tuple[str, ...], out: Path, file_format: str) -> list[Path]:
-    """Write the figures of these names, and return their paths; without names those of all figures,
-    of which one that takes minutes is left out and its file says so.
-
-    They are written as ``out`` if its suffix is that of a picture file, else as
-    ``out``/NAME.``file_format``. Raises ScenarioError for unknown names, before any file is
-    written, and WriteError if a file cannot be written.
+    """Write the figures of these names (default: all but slow ones) as ``out`` if that is a picture
+    file, else ``out``/NAME.``file_format``; return their paths. Raises ScenarioError and
+    WriteError.
     """
     figure_set = FigureSet(result)
     omit_slow = not names

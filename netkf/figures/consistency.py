@@ -86,10 +86,7 @@ def nis_figure(data: FigureData) -> Picture:
 
 
 def draw_nis(axes: Any, innovations: Innovations) -> tuple[float, float]:
-    """Draw NIS (the squared innovation in units of its covariance) divided by its degrees of
-    freedom over time, reading by reading and as means over bins of time; return the share of
-    readings in the interval that holds if P is exact, and the mean.
-    """
+    """Draw NIS over its degrees of freedom; return the share inside its interval, and the mean."""
     finite = np.isfinite(innovations.nis)
     times, nis = innovations.times[finite], innovations.nis[finite]
     rows = innovations.rows[finite].astype(np.float64)  # degrees of freedom of each reading

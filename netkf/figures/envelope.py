@@ -15,9 +15,7 @@ COLUMNS = 3
 
 
 def envelope_figure(table: Any) -> Picture:
-    """Draw, of each quantity of the ``envelope`` of a fit, the range of each law and the replay;
-    raises UnavailableError without runs.
-    """
+    """Draw each quantity's range by law, and the replay; raises UnavailableError without runs."""
     if not len(table):
         raise UnavailableError("The laws were not run: netkf fit without --no-runs does so.")
     quantities, laws = list(table["quantity"].unique()), list(table["law"].unique())

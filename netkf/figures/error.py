@@ -33,10 +33,7 @@ MAX_ROWS = 60  # nodes whose labels still fit beside each other
 
 
 def error_figure(data: FigureData) -> Picture:
-    """Draw the errors, and below them the roots of trace P, over time, with the bound that theory
-    gives on trace P; without ground truth the estimates and the NIS (squared innovations in units
-    of their covariances).
-
+    """Draw errors and roots of trace P with its bound; without ground truth the estimates and NIS.
     Raises UnavailableError without samples.
     """
     data.require_samples()

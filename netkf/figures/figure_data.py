@@ -76,9 +76,7 @@ class FigureData:
 
     @property
     def nees_unit(self) -> tuple[int, Any]:
-        """The expected NEES, and its divisor, of all or of each node (N,): n and 1, or 1 and n
-        where nodes have states of different size.
-        """
+        """The expected NEES, and its divisor: n and 1, or 1 and n (N,) if sizes differ."""
         sizes = self.scenario.sizes
         return (int(sizes[0]), 1.0) if np.ptp(sizes) == 0 else (1, sizes)
 
@@ -154,10 +152,8 @@ class FigureData:
         return f"{self.runs:,} runs, seed {self.seed}"
 
     def caption(self, *sentences: str, notes: str = "") -> list[str]:
-        """Return the paragraphs of a figure's caption: the scenario, the runs, how they ended and
-        the ``sentences``; then notes on assumptions of the papers that the scenario does not meet.
-
-        ``notes`` selects those on the "bound" on P, on "nees", or on "both"; none if empty.
+        """Return the paragraphs of a caption: the runs, the ``sentences``, and ``notes`` on
+        assumptions that are not met, on the "bound" on P, on "nees", or on "both".
         """
         n = len(self.nodes)
         origin = f"{self.scenario.name}: {n} node{'s' if n > 1 else ''}, {self.count_text}."
@@ -251,11 +247,7 @@ def reduce_samples(
     summary: dict[str, Any],
     **attributes: Any,
 ) -> FigureData:
-    """Return the data to draw of one run, from the samples that ``sink`` collected, the bounds and
-    limits that theory gives (``promised``), and the contents of summary.json.
-
-    ``attributes`` are further attributes of FigureData.
-    """
+    """Return the data of one run from ``sink``, ``promised`` bounds and limits, and a summary."""
     shape = len(sink.times), len(scenario.nodes)
     error, trace, nees, first_component = (
         np.array(values, dtype=np.float64).reshape(shape)
@@ -278,11 +270,7 @@ def reduce_samples(
 
 
 def reduce_ensemble(scenario: Scenario, ensemble: Ensemble, promised: PromisedTraces) -> FigureData:
-    """Return the data to draw of an ensemble: means over its runs of squared error, trace of P and
-    NEES, (T, N) each, with standard errors.
-
-    promised : traces of the bounds and limits that theory gives for the scenario's filter
-    """
+    """Return the data of an ensemble: means over runs (T, N) with standard errors."""
     default_status = "diverged" if ensemble.diverged else "complete"
     return FigureData(
         scenario=scenario,

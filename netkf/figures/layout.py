@@ -20,9 +20,7 @@ Positions = dict[int, tuple[float, float]]
 
 
 def get_positions(scenario: Any, run: Any = None) -> Positions:
-    """Return the positions of the nodes: where the scenario says that they begin, in the first
-    sample of a ``run`` if there is one; computed ones where it does not say so.
-    """
+    """Return where nodes begin by the scenario or in a ``run``, else computed positions."""
     places, x = scenario.positions, scenario.plant.start_mean
     if run is not None and len(run.x):
         x = np.where(np.isfinite(run.x[0]), run.x[0], x)

@@ -54,9 +54,7 @@ def matrix_figure(data: FigureData) -> Picture:
 
 
 def fate_figure(data: FigureData) -> Picture:
-    """Draw the correlation of the outcomes of hearers of the same broadcasts; raises
-    UnavailableError.
-    """
+    """Draw correlations of outcomes of hearers of one broadcast; raises UnavailableError."""
     fates = fate_matrix(_require_outcomes(data), len(data.nodes))
     if not (data.scenario.has_broadcasts and np.isfinite(fates).any()):
         reason = "No two nodes could hear the same transmission, or they lost all or nothing."
@@ -102,9 +100,7 @@ def _draw_matrix(
 
 
 def losses_figure(data: FigureData) -> Picture:
-    """Draw the share lost over time, of all messages and by direction, with the times at which
-    nodes were down; raises UnavailableError.
-    """
+    """Draw the share lost over time, in all and by direction; raises UnavailableError."""
     outcomes = _require_outcomes(data)
     edges = np.linspace(0.0, data.scenario.horizon, WINDOWS + 1)
     links, shares = loss_windows(outcomes, len(data.nodes), edges)

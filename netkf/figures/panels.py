@@ -43,11 +43,7 @@ def select_evenly(indices: np.ndarray, max_count: int = MAX_LINES) -> np.ndarray
 
 
 def draw_nodes(axes: Any, data: FigureData, values: FloatArray, se: FloatArray | None) -> None:
-    """Draw one line for each column of ``values`` (T, N), those of nodes with a sensor on top.
-
-    ``se`` (T, N), if given, are the standard errors of the squares of ``values``: each line gets
-    its 95% interval.
-    """
+    """Draw ``values`` (T, N) by node, with 95 % intervals if their squares have errors ``se``."""
     width = 1.1 if len(data.nodes) <= 12 else 0.6
     groups = (
         (~data.has_sensor, RELAY, 1, "without a sensor"),
@@ -93,11 +89,7 @@ def shade_downtimes(axes: Any, data: FigureData) -> None:
 
 
 def draw_errors(axes: Any, data: FigureData, bound: bool = False) -> None:
-    """Draw the error of each node and the RMS error of all over time; without ground truth the
-    first component of the estimates instead.
-
-    With ``bound`` the root of the bound that theory gives on trace P is drawn too.
-    """
+    """Draw errors by node and the RMS of all, and the root of the bound; else first estimates."""
     if not data.shows_errors:
         if data.first_component is None:
             draw_message(axes, NO_TRUTH)

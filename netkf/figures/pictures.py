@@ -26,9 +26,8 @@ def ensemble_picture(scenario: Scenario, finished: FinishedEnsemble) -> None:
 
 
 def overview(data: FigureData) -> Picture:
-    """Return a figure of a run or an ensemble in four panels: the errors, the roots of trace P with
-    the bound and the limits that theory gives, NEES, and the network; without ground truth the
-    estimates, and no NEES.
+    """Return four panels: errors, roots of trace P with bound and limits, NEES, and the network;
+    without ground truth estimates, and no NEES.
     """
     figure = new_figure(11.0, 8.2)
     if data.shows_errors:

@@ -37,9 +37,7 @@ NO_TRUTH = "None of them has a ground truth, so that their errors are unknown."
 
 
 def errors_figure(curves: Sequence[ErrorCurve], origin: str = "") -> Picture:
-    """Return the mean square errors ``curves`` over time as one figure; ``origin`` begins its
-    caption.
-    """
+    """Draw mean square errors ``curves`` over time; ``origin`` begins the caption."""
     # A curve has the look of its place, whichever of the others have errors.
     placed = [(k, c) for k, c in enumerate(curves) if np.isfinite(c.square).any()]
     known = [c for _, c in placed]
@@ -131,9 +129,8 @@ def _headline(curves: Sequence[ErrorCurve]) -> str:
 def curves_of(
     results: Sequence[Any] | Mapping[str, Any],
 ) -> tuple[tuple[ErrorCurve, ...], str]:
-    """Return the curves of runs and ensembles, by label or in a list, whose labels are what tells
-    them apart: their filters, else their scenarios, else numbers; and a sentence on the runs.
-    Raises ScenarioError.
+    """Return the curves of results by label, or by what tells them apart: filters, scenarios or
+    numbers; and a sentence on the runs. Raises ScenarioError.
     """
     if isinstance(results, Mapping):
         labels, found = [str(label) for label in results], list(results.values())

@@ -53,11 +53,9 @@ MAX_TEXT = 24
 
 
 def stability_figure(data: FigureData) -> Picture:
-    """Draw a map: for which link rates and delivery probabilities the bound on the mean of P over
-    time (hybrid paper, H equation 12) has a steady state, by theory alone.
+    """Draw for which link rates and delivery probabilities the bound H (12) has a steady state.
 
-    Raises UnavailableError if the bound does not apply, or without a rate and a delivery
-    probability.
+    Raises UnavailableError if it does not apply, or without a rate and a delivery probability.
     """
     scenario = data.scenario
     reason = "clocks in slots have no rate" if scenario.slotted else reason_without_bound(scenario)
@@ -96,10 +94,8 @@ def stability_figure(data: FigureData) -> Picture:
 
 
 def reason_to_omit_stability(data: FigureData) -> str | None:
-    """Return the reason to leave the map out where all figures are drawn, None if it takes seconds.
-
-    It solves coupled equations for the covariances (n, n) of all N nodes at up to 17 points of rate
-    and delivery, and one just below the threshold takes the longest.
+    """Return why the map is left out where all figures are drawn, None if it takes seconds: it
+    solves coupled equations of all N nodes at up to 17 points.
     """
     scenario = data.scenario
     n = scenario.plant.n
@@ -130,15 +126,9 @@ def _map_stable(scenario: Scenario, rates: Sequence[float]) -> np.ndarray:
 
 
 def sweep_figure(name: str, table: Any, keys: Sequence[str], status: str) -> Picture:
-    """Draw the largest RMS error of a sweep over one or two keys, and mark points at which runs
-    diverged or there is no bound.
-
-    name   : that of the scenario
-    table  : a row for each point, as ``netkf.sweep`` returns it
-    keys   : paths of the keys that were varied, which are columns of the table
-    status : that of the manifest, such as "complete"
-
-    Raises UnavailableError for more keys, and without a finished point.
+    """Draw the largest RMS error of a ``table`` of ``netkf.sweep`` over one or two keys, and mark
+    points that diverged or have no bound. Raises UnavailableError for more keys, or without a
+    point.
     """
     points = f"{name}: {len(table)} points"
     if status != "complete":
@@ -249,11 +239,8 @@ SAME_TRACES = 1e-6
 
 
 def law_figure(data: FigureData) -> Picture:
-    """Draw the share of samples whose trace of P exceeds a value, and that of the law of P in the
-    steady state, if the paper on the random Riccati equation (R) applies: readings of one sensor
-    that arrive independently.
-
-    Raises UnavailableError without samples and covariances, and for an ensemble.
+    """Draw the law of trace P of samples and that of its steady state by the paper R (readings of
+    one sensor that arrive independently). Raises UnavailableError where there is none.
     """
     data.require_samples()
     data.require_covariance()

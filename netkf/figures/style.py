@@ -103,10 +103,8 @@ def finish_figure(figure: Figure, headline: str, caption: Sequence[str]) -> None
 
 
 def break_lines(text: str, width: float, size: float, weight: str = "normal") -> str:
-    """Return a text broken into lines of at most ``width`` points, in a font of ``size`` points.
-
-    Control characters are removed and dollar signs escaped, since names come from files and
-    matplotlib would draw text between dollar signs as a formula.
+    """Return a text in lines of at most ``width`` points in a font of ``size`` points, without
+    control characters, and with escaped dollar signs, which matplotlib takes for formulas.
     """
     lines = [""]
     for word in one_line(text).split():
@@ -209,9 +207,7 @@ def message_figure(headline: str, message: str, caption: Sequence[str]) -> Pictu
 
 
 def set_scale(axes: Any, values: FloatArray, levels: Sequence[float] = ()) -> None:
-    """Set the y axis for ``values``: logarithmic above LOG_MEDIANS times their median, or if the
-    ``levels`` of curves differ by a factor of LOG_LEVELS, so that the lowest can be read.
-    """
+    """Set the y axis: logarithmic above LOG_MEDIANS medians, or if ``levels`` differ much."""
     positive = np.minimum(values[np.isfinite(values) & (values > 0.0)], MAX_DRAWN)
     known = [level for level in levels if 0.0 < level < np.inf]
     apart = max(known, default=0.0) > LOG_LEVELS * min(known, default=0.0)

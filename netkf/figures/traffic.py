@@ -97,12 +97,7 @@ def _sum_excess(values: FloatArray, levels: FloatArray) -> FloatArray:
 
 
 def age_of_information(log: np.ndarray, node: int, end: float) -> AgeSawtooth:
-    """Return the age of information of a ``node`` (id) from time 0 to ``end`` seconds; ``log`` (E,)
-    are the EVENT rows of a run.
-
-    It is the time since the newest message that has arrived was sent; before the first arrival the
-    time since 0.
-    """
+    """Return the time since the newest arrived message was sent, until ``end`` (s)."""
     arrived, sent = newest_arrivals(log, node)
     before_end = arrived < end
     start = np.concatenate([[0.0], arrived[before_end]])
@@ -264,9 +259,7 @@ def _require_messages(data: FigureData) -> list[DirectedMessages]:
 
 
 def wilson_interval(delivered: Any, total: Any) -> tuple[Any, Any]:
-    """Return the two ends of Wilson's interval of a delivery probability, at the level CONFIDENCE,
-    for numbers of messages or arrays (K,) of them.
-    """
+    """Return the ends of Wilson's interval of a delivery probability at the level CONFIDENCE."""
     z2, share = NormalDist().inv_cdf(0.5 + CONFIDENCE / 2.0) ** 2, delivered / total
     half = np.sqrt(z2 * (share * (1.0 - share) + z2 / (4.0 * total)) / total)
     centre, scale = share + z2 / (2.0 * total), 1.0 + z2 / total

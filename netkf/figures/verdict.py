@@ -40,11 +40,8 @@ OTHER = _Mark(MUTED, "s", "undecided")
 
 
 def verdict_picture(path: Path, verdict: Verdict, claim: str) -> bool:
-    """Write the picture to ``path`` and return True; return False if no row has an interval.
-
-    Every row that was decided by an interval shows it in units of what it tolerates, with a mark at
-    the error that would have been seen with probability 0.9. ``claim`` is the scenario's own claim
-    for the title; if it is empty, the title has the scenario's name.
+    """Write the picture and return True, False if no row has an interval. Rows show it in units of
+    what they tolerate, with a mark at the error that is found with probability 0.9.
     """
     rows = [row for row in verdict.rows if row.low < row.high and row.tolerance > 0.0]
     if not rows:

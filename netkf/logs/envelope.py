@@ -110,9 +110,7 @@ class Law(NamedTuple):
         return "\n".join(["sender,receiver,to_bad,to_good", *lines, ""])
 
     def loss_table(self, values: FloatArray) -> dict[str, Any]:
-        """Return the table network.channel.loss with these ``values``, which may refer to the
-        ``file``.
-        """
+        """Return the table network.channel.loss with these ``values``, which may name ``file``."""
         if self.file:
             kind = "scheduled" if self.rows else "gilbert-elliott"
             return {"kind": kind, "path": self.file}
@@ -123,9 +121,7 @@ class Law(NamedTuple):
         return {"kind": self.kind, **table}
 
     def apply(self, scenario: Scenario, values: FloatArray, folder: Path) -> Scenario:
-        """Return a scenario whose losses are those of the law with ``values``, and its ``file`` in
-        an empty ``folder``.
-        """
+        """Return a scenario with the losses of the law, and its ``file`` in an empty ``folder``."""
         changed: dict[str, Any] = {"network.channel.loss": self.loss_table(values)}
         if self.file:
             write_text(folder / self.file, self.text(values))
@@ -139,9 +135,7 @@ class Law(NamedTuple):
 
 
 def edges_with(scenario: Scenario, deliveries: dict[tuple[str, str], float]) -> dict[str, Any]:
-    """Return the graph of a scenario as edges with these deliveries; a link without one has their
-    mean, and that of an undirected graph the mean of its directions.
-    """
+    """Return the graph of a scenario as edges with these deliveries, the mean for other links."""
     topology, mean = scenario.topology, float(np.mean([*deliveries.values()]))
     name = {node: getattr(node, "name", int(node)) for node in topology.nodes}
     table: dict[str, Any] = {"kind": "edges", "nodes": [name[node] for node in topology.nodes]}
@@ -167,12 +161,11 @@ def compare_with_laws(
     progress: Progress | None,
 ) -> pd.DataFrame:
     """Return a row for each law and quantity: the value of the replay, which is replica 0, and the
-    range of ``runs`` runs of the law, replicas 1 to ``runs``, whose parameters are drawn anew; by
-    default as many as take about BUDGET seconds, RUNS at most.
+    range of ``runs`` runs of the law, by default as many as take about BUDGET seconds.
 
     If a law is true its runs and the replay are exchangeable: p is twice the smaller rank of the
-    replay among all of them, over their number. Where so few runs can reject nothing by ranks, p is
-    by Student's t, as of a normal quantity. Ranges and verdicts of a law hold together.
+    replay among all of them, over their number; by Student's t where so few reject nothing by
+    ranks.
     """
     simulate(scenario, scenario.seed, 0)  # what is compiled, or read, is so once
     begin = time.perf_counter()
@@ -220,10 +213,7 @@ def law_run(
 
 
 def measure_run(scenario: Scenario, run: Run) -> dict[str, float]:
-    """Return error over all nodes and times and at the worst instant (of P where there is no
-    truth), mean age of what nodes have heard of their senders, messages heard, and the share of
-    samples at which recent packets connect all nodes.
-    """
+    """Return errors (P without truth), mean age, messages heard, and the share connected."""
     later = run.times > 0.0
     squares = run.sq_error if run.truth_known else np.trace(run.P, axis1=2, axis2=3)
     by_time = squares[later].mean(axis=1)

@@ -187,11 +187,8 @@ def fit_log(
 
 
 def read_outcomes(scenario: Scenario) -> tuple[pd.DataFrame, list[str]]:
-    """Return the recorded outcomes of a scenario, a row for each message that is listed, and notes.
-    Raises ScenarioError.
-
-    Packets that nobody reported count as lost: without them those that are left were all heard by
-    somebody, which would bias deliveries and make hearers look dependent.
+    """Return recorded outcomes by message, and notes. Packets that nobody reported count as lost:
+    those left were all heard by somebody, which would bias deliveries. Raises ScenarioError.
     """
     loss = scenario.network.channel.loss
     if not isinstance(loss, RecordedLoss):
@@ -241,9 +238,7 @@ def _complete_replay(
     links: pd.DataFrame,
     notes: list[str],
 ) -> Scenario:
-    """Return the scenario with outcomes in place of those that are not known, drawn once by the
-    deliveries of their links: else the replay would have more losses than any law.
-    """
+    """Return the scenario with unknown outcomes drawn once, by the deliveries of their links."""
     missing = int(links["unknown"].sum())
     if not missing:
         return scenario
@@ -267,8 +262,8 @@ def _complete_replay(
 def run_tests(
     outcomes: Outcomes, distance: FloatArray | None
 ) -> tuple[dict[str, Test], stats.Share, float, FloatArray]:
-    """Return a test of each assumption that the log can tell of, the shared fate, the correlation
-    time in packets, and the edges of windows of time in which quality hardly changes.
+    """Return a test of each assumption, the shared fate, the correlation time in packets, and the
+    edges of windows of time in which quality hardly changes.
     """
     constancy = stats.test_constancy(outcomes, stats.correlation_time(outcomes))
     edges = stats.choose_windows(outcomes) if constancy.p < MAYBE else np.empty(0)
@@ -423,9 +418,7 @@ def _fit_laws(
 def _varying_laws(
     outcomes: Outcomes, edges: FloatArray, tests: Mapping[str, Test], shrink: float, end: float
 ) -> list[Law]:
-    """Return the laws whose one delivery of all links changes in time, or with the channel of a
-    transmission, where the log tells of that.
-    """
+    """Return laws whose delivery changes in time or with the channel, where the log tells of it."""
     index, laws = list(outcomes.links), []
     if len(edges):
         counts = stats.counts_in(outcomes, edges)

@@ -32,10 +32,7 @@ PAUSE = 5.0
 
 
 def read_mercator(log: Path) -> PacketLog:
-    """Return the packet log of a raw CSV file of mercator, or of all those in a folder.
-
-    Raises ScenarioError, with file and line, for a file that is none.
-    """
+    """Return the packet log of a file of mercator, or of a folder of them; raises ScenarioError."""
     paths = sorted([*log.glob("*.csv"), *log.glob("*.csv.gz")]) if log.is_dir() else [log]
     places = find_extra(log, "positions")
     paths = [path for path in paths if path != places]
@@ -120,9 +117,7 @@ def _count_from_zero(table: pd.DataFrame, notes: list[str], log: str) -> None:
 
 
 def _number_bursts(table: pd.DataFrame, notes: list[str]) -> np.ndarray:
-    """Return the number of the burst of each row: rows of one counter, sender and channel whose
-    stamps are no farther apart than a burst is long.
-    """
+    """Return the burst of each row: of one counter, sender and channel, and close in time."""
     key = ["srcmac", "transctr", "frequency"]
     order = table.sort_values([*key, "t"], kind="stable")
     same = (order[key] == order[key].shift()).all(axis=1)

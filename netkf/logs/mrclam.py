@@ -77,10 +77,8 @@ estimates = "own"
 
 
 def read_mrclam(folder: Path) -> tuple[dict[str, str], tuple[str, ...]]:
-    """Return the scenario and the tables of a data set in a ``folder``, as texts by the names of
-    their files, and notes on rows that are out of order, repeat others, are missing or unknown.
-
-    Raises ScenarioError, with the line, for a file that is not as MR.CLAM's are.
+    """Return the scenario and tables of a data set, as texts by the names of their files, and
+    notes. Raises ScenarioError, with the line.
     """
     found = [re.fullmatch(r"Robot(\d+)_Odometry\.dat", path.name) for path in folder.glob("*")]
     nodes = sorted(int(match.group(1)) for match in found if match)
@@ -163,9 +161,7 @@ def _read_by_key(path: Path, columns: Sequence[str], key: str) -> dict[float, li
 
 
 def _read_robots(folder: Path, name: str, nodes: list[int], notes: list[str]) -> pd.DataFrame:
-    """Return the rows of one file of all robots, in the order of their times: of odometry and poses
-    one a time, the last one, and of readings all that differ.
-    """
+    """Return the rows of one file of all robots by time, without rows that repeat others."""
     tables, is_reading = [], name == "Measurement"
     for node in nodes:
         file = f"Robot{node}_{name}.dat"

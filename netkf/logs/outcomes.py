@@ -112,9 +112,7 @@ class Outcomes:
 
     @cached_property
     def transitions(self) -> FloatArray:
-        """Counts by link (L, 4): packets heard that have a next one, those of them whose next is
-        lost, packets lost that have one, and those whose next is heard.
-        """
+        """Counts by link (L, 4): heard with a next, these then lost; lost, these then heard."""
         moves = np.zeros((len(self.links), 4))
         for group in self.groups:
             last, now = group.x[:-1], group.x[1:]
@@ -139,8 +137,8 @@ class Outcomes:
 
 
 def make_outcomes(table: pd.DataFrame) -> Outcomes:
-    """Return outcomes from a table sender, receiver, message, t, transmission, delivered (nan where
-    it is not known), and maybe channel, with a row for each message of each link.
+    """Return the outcomes of a ``table`` of messages: sender, receiver, message, t, transmission,
+    delivered (nan: unknown), and maybe channel.
     """
     pairs = table[["sender", "receiver"]].drop_duplicates().sort_values(["sender", "receiver"])
     links = [(str(i), str(j)) for i, j in pairs.itertuples(index=False)]
@@ -192,9 +190,7 @@ def counts_in(outcomes: Outcomes, edges: FloatArray) -> np.ndarray:
 
 
 def choose_windows(outcomes: Outcomes) -> FloatArray:
-    """Return the edges (K - 1,) of the K windows, a power of two of them, that tell best of slow
-    changes (AIC); what hearers share and what lasts less long than a window counts as noise.
-    """
+    """Return the edges (K - 1,) of the 2^j windows of time that tell best of slow changes (AIC)."""
     t = np.concatenate([group.t for group in outcomes.groups])
     z = np.concatenate([group.residuals.sum(axis=1) for group in outcomes.groups])
     size = np.concatenate(
@@ -219,9 +215,7 @@ def choose_windows(outcomes: Outcomes) -> FloatArray:
 def binomial_interval(
     heard: FloatArray, count: FloatArray, level: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the ends of exact (Clopper-Pearson) intervals of error ``level``; counts need not be
-    integers.
-    """
+    """Return the ends of Clopper-Pearson intervals of error ``level``; counts may be fractions."""
     with np.errstate(invalid="ignore"):
         low = np.where(heard > 0.0, beta.ppf(level / 2, heard, count - heard + 1.0), 0.0)
         high = np.where(heard < count, beta.ppf(1 - level / 2, heard + 1.0, count - heard), 1.0)
@@ -229,9 +223,7 @@ def binomial_interval(
 
 
 def _z_test(assumption: str, what: str, units: FloatArray, scale: float) -> Test:
-    """Return a test that the ``units`` (T,), sums of products of residuals, have mean 0; they are
-    as large as ``scale`` in all if the departure is 1.
-    """
+    """Return a test that ``units`` (T,), as large as ``scale`` for 1, have mean 0."""
     variance = long_run_sum(units, 0)
     if scale <= 0.0 or variance <= 0.0 or len(units) < MIN_PACKETS:
         return Test(assumption, what, np.nan, np.nan, np.nan)
@@ -241,9 +233,7 @@ def _z_test(assumption: str, what: str, units: FloatArray, scale: float) -> Test
 
 
 def long_run_sum(units: FloatArray, lags: int) -> float:
-    """Return the variance of the sum of ``units`` (T,) of mean 0, correlated up to ``lags``
-    (Bartlett weights).
-    """
+    """Return the variance of the sum of correlated ``units`` (T,), with Bartlett weights."""
     total = float(units @ units)
     for lag in range(1, min(lags, len(units) - 1) + 1):
         total += 2.0 * (1.0 - lag / (lags + 1.0)) * float(units[lag:] @ units[:-lag])
@@ -251,8 +241,8 @@ def long_run_sum(units: FloatArray, lags: int) -> float:
 
 
 def autocorrelation(outcomes: Outcomes, lag: int) -> tuple[FloatArray, float]:
-    """Return sums over hearers of products of residuals ``lag`` transmissions apart, one for each
-    transmission (T,), and what they are in all for a correlation of 1.
+    """Return products of residuals ``lag`` transmissions apart (T,), and their sum for a
+    correlation of 1.
     """
     units, scale = [], 0.0
     for group in outcomes.groups:
@@ -277,9 +267,7 @@ def _unbroken(follows: np.ndarray, lag: int) -> np.ndarray:
 
 
 def correlation_time(outcomes: Outcomes) -> float:
-    """Return 1 + 2 sum of autocorrelations, cut where they are noise: by so much fewer independent
-    packets there are than packets.
-    """
+    """Return 1 + 2 sum of autocorrelations, cut at noise: packets for one independent packet."""
     total = 1.0
     longest = max(len(group.t) for group in outcomes.groups)
     for lag in range(1, longest // 4):
@@ -297,9 +285,7 @@ def test_time(outcomes: Outcomes) -> Test:
 
 
 def test_memory(outcomes: Outcomes) -> Test:
-    """Test that bursts are those of a chain whose state is the last outcome: given it, the one
-    before says nothing.
-    """
+    """Test that given the last outcome the one before says nothing, as in a chain of two states."""
     units, scale = [], 0.0
     for group in outcomes.groups:
         if len(group.t) < 3:
@@ -331,8 +317,8 @@ class Share(NamedTuple):
 
 
 def shared_fate(outcomes: Outcomes, lags: int) -> tuple[Share, Test]:
-    """Return the share of transmissions whose hearers have one fate, by the covariances of hearers:
-    share c makes that of two hearers c (min(p, q) - p q); and the test that it is 0.
+    """Return the share c of transmissions whose hearers have one fate, which makes covariances of
+    hearers c (min(p, q) - p q), and the test that it is 0.
     """
     sums, sizes, slopes, lasting = [], [], [], 0.0
     alone = together = 0.0
@@ -371,9 +357,7 @@ def shared_fate(outcomes: Outcomes, lags: int) -> tuple[Share, Test]:
 
 
 def shared_law(outcomes: Outcomes, delivery: float, share: float) -> tuple[float, float]:
-    """Return the log-likelihood of one delivery and share for all, and the variance of the mean
-    delivery, whose units are transmissions.
-    """
+    """Return the log-likelihood of one delivery and share, and the variance of the mean."""
     likelihood = spread = 0.0
     for group in outcomes.groups:
         n, k = np.isfinite(group.x).sum(axis=1), np.nansum(group.x, axis=1)
@@ -386,9 +370,7 @@ def shared_law(outcomes: Outcomes, delivery: float, share: float) -> tuple[float
 
 
 def _shrinkage(outcomes: Outcomes) -> float:
-    """Return by how much deliveries of the hearers of a sender differ, as a share of how much their
-    estimates do: the smaller of two estimates of one delivery is too small.
-    """
+    """Return the share of the spread of estimated deliveries that is not noise."""
     between = noise = 0.0
     for group in outcomes.groups:
         p, n = group.mean, np.isfinite(group.x).sum(axis=0)
@@ -403,9 +385,7 @@ def _shrinkage(outcomes: Outcomes) -> float:
 
 
 def test_constancy(outcomes: Outcomes, time: float) -> Test:
-    """Test that deliveries do not change slowly, by correlations of the means of BLOCKS parts of
-    the log, each long against the correlation ``time`` (packets).
-    """
+    """Test by correlations of BLOCKS means that deliveries do not change slowly."""
     name, what = "quality does not change in time", "deviation of delivery over time"
     t = np.concatenate([group.t for group in outcomes.groups])
     z = np.concatenate([group.residuals.sum(axis=1) for group in outcomes.groups])
@@ -437,8 +417,8 @@ def test_constancy(outcomes: Outcomes, time: float) -> Test:
 def test_identical(
     assumption: str, counts: FloatArray, expected: FloatArray, spread: FloatArray, used: int
 ) -> Test:
-    """Test that deliveries of K links, or parts of links, are the ``expected`` ones (K,), where
-    ``counts`` (K, 2) has packets and those heard.
+    """Test that deliveries, by packets and those heard ``counts`` (K, 2), are the ``expected``
+    (K,).
 
     ``spread`` (K,) are the eigenvalues of the covariance of their standardised residuals, of which
     ``used`` are taken by estimated parameters.
@@ -461,9 +441,7 @@ def test_identical(
 
 
 def residual_spread(outcomes: Outcomes, share: float, time: float) -> FloatArray:
-    """Return the eigenvalues (L,) of the covariance of standardised residuals of links, whose
-    hearers have that ``share`` of one fate, and packets that correlation ``time``.
-    """
+    """Return the eigenvalues (L,) of the covariance of standardised residuals of links."""
     share = min(max(share, 0.0), 1.0) if np.isfinite(share) else 0.0
     senders = pd.Series([sender for sender, _ in outcomes.links]).value_counts().to_numpy()
     parts = [np.append(np.full(n - 1, 1.0 - share), 1.0 + share * (n - 1)) for n in senders]
@@ -516,9 +494,7 @@ def _sum_of(outcomes: Outcomes, lag: int) -> float:
 
 
 def _pad_stretches(outcomes: Outcomes) -> np.ndarray:
-    """Return outcomes of all unbroken stretches of all links, (S, T) codes 0, 1, or 2 for unknown
-    and 3 beyond the end.
-    """
+    """Return outcomes of unbroken stretches, (S, T) codes 0, 1, 2 unknown, 3 beyond the end."""
     parts = [
         np.where(np.isfinite(part), part, 2.0)
         for group in outcomes.groups
@@ -551,9 +527,7 @@ def _surprise(x: FloatArray, stretches: np.ndarray) -> float:
 
 
 def _inverse_curvature(x: FloatArray, stretches: np.ndarray) -> FloatArray:
-    """Return the inverse of the second derivatives (4, 4) of the surprise, whose directions that
-    say nothing have the variance 4 of a wide prior.
-    """
+    """Return the inverse second derivatives (4, 4) of the surprise, with a wide prior."""
     step, size = 0.02, len(x)
     H = np.zeros((size, size))
     base, unit = _surprise(x, stretches), step * np.eye(size)
@@ -575,9 +549,7 @@ def _pairs(size: int) -> Iterator[tuple[int, int]]:
 def fit_distance(
     distance: FloatArray, count: FloatArray, heard: FloatArray, spread: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return half and width of the logistic function of the distance that makes deliveries
-    likeliest, and their covariance (2, 2), ``spread`` times that of independent packets.
-    """
+    """Return half and width of the likeliest logistic delivery, and their covariance (2, 2)."""
     X = np.stack([np.ones_like(distance), -distance], axis=1)
     slopes = np.array([0.0, 1.0 / max(float(distance.std()), 1e-9)])
     slopes[0] = slopes[1] * float(distance.mean())

@@ -73,11 +73,9 @@ class _Rows(NamedTuple):
 
 
 def read_tables(log: Path, columns: Mapping[str, str]) -> PacketLog:
-    """Return the packet log of a table, or of a folder: of packets.csv, or else of all tables but
-    positions.csv and readings.csv, which may stand beside them. ``columns`` names columns: by name
-    in SYNONYMS, with an ending if it needs a unit, what tables call it.
-
-    Raises ScenarioError, with file and line, for a table that cannot be read.
+    """Return the packet log of a table, or of a folder: packets.csv, or else all tables but
+    positions.csv and readings.csv. ``columns`` has names of columns by names in SYNONYMS. Raises
+    ScenarioError.
     """
     notes: list[str] = []
     tables = _rename({path: read_texts(path) for path in _packet_paths(log)}, columns)
@@ -200,9 +198,7 @@ def _read_rows(path: Path, raw: pd.DataFrame, notes: list[str]) -> _Rows:
 
 
 def _find_columns(path: Path, raw: pd.DataFrame, notes: list[str]) -> dict[str, str]:
-    """Return the column that each of SYNONYMS has, "" if none; where rows are of a node's own log
-    columns sender and receiver are added. A note tells which were used.
-    """
+    """Return the column of each of SYNONYMS, "" if none; a node's own log gets both ends."""
     names = {name: find_column(raw, name) for name in SYNONYMS}
     if names["event"] and not names["sender"] and names["node"]:
         events = raw[names["event"]].str.lower()
@@ -398,9 +394,7 @@ def _skipped(sends: pd.DataFrame, notes: list[str]) -> pd.DataFrame:
 
 
 def _merge_rows(rows: pd.DataFrame, notes: list[str], log: str) -> pd.DataFrame:
-    """Return one outcome for each transmission and receiver; raises ScenarioError if two rows
-    contradict each other.
-    """
+    """Return one outcome by transmission and receiver; raises ScenarioError if two contradict."""
     key = ["send", "receiver"]
     repeated = int(rows.duplicated(key).sum())
     kinds = rows[rows["heard"].notna()].groupby(key)["heard"].nunique()
@@ -432,9 +426,7 @@ def read_positions(path: Path) -> pd.DataFrame:
 
 
 def read_readings(path: Path, origin: Decimal, column: str = "") -> pd.DataFrame:
-    """Return a table t (s from ``origin``), node, y0 of the first column of numbers, or of the one
-    with this name; raises ScenarioError.
-    """
+    """Return t (s from ``origin``), node, y0 of a ``column`` or the first (ScenarioError)."""
     raw = read_texts(path)
     stamp, node = find_column(raw, "t"), find_column(raw, "node") or find_column(raw, "sender")
     rest = [name for name in raw.columns if name not in (stamp, node)]

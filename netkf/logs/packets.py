@@ -77,9 +77,7 @@ def count_phrase(count: int, what: str) -> str:
 
 
 def read_texts(path: Path) -> pd.DataFrame:
-    """Return the rows of a table as texts, by the numbers of their lines; names of columns in lower
-    case. Raises ScenarioError, with the line, for a file that is none, or a row of another length.
-    """
+    """Return a table as texts by line number, names in lower case; raises ScenarioError."""
     rows: list[list[str]] = []
     lines: list[int] = []
     source = SourceFile(path.name, path.parent)
@@ -111,9 +109,7 @@ def _with_points(column: pd.Series) -> pd.Series:
 
 
 def parse_numbers(path: Path, table: pd.DataFrame, name: str, gaps: bool = False) -> FloatArray:
-    """Return a column as finite numbers (K,), nan where ``gaps`` may be empty; raises
-    ScenarioError with the line of another entry.
-    """
+    """Return a column as numbers (K,), nan in ``gaps``; raises ScenarioError with the line."""
     texts = table[name]
     values = np.asarray(pd.to_numeric(texts, errors="coerce"), dtype=float)
     is_gap = np.asarray(texts.str.lower().isin(["", "nan", "none", "na"])) & gaps
@@ -125,10 +121,7 @@ def parse_numbers(path: Path, table: pd.DataFrame, name: str, gaps: bool = False
 
 
 def _find_unit(path: Path, table: pd.DataFrame, name: str, notes: list[str] | None) -> str:
-    """Return the unit of a column of stamps: the one that ends its name, as in t_ms, else seconds,
-    unless these would be after the year 5000. Such stamps are in the unit in which they are times
-    since 1970 of the years 1990 to 2100, and a note says so; others are refused (ScenarioError).
-    """
+    """Return the unit that ends the name of stamps, else s, or what their size tells."""
     unit, first = name.rpartition("_")[2], str(next(iter(table[name]), ""))
     size = abs(float(first)) if re.fullmatch(r"[+-]?\d{12,}(\.\d*)?", first) else 0.0
     if unit in UNITS or size < MAX_SECONDS:
@@ -146,9 +139,8 @@ def _find_unit(path: Path, table: pd.DataFrame, name: str, notes: list[str] | No
 def parse_stamps(
     path: Path, table: pd.DataFrame, name: str, notes: list[str] | None = None
 ) -> list[Decimal]:
-    """Return a column of stamps as exact seconds (K,): numbers in the unit that ends the name of
-    the column, as t_ms, or that their size tells, of which ``notes`` get a line; ISO 8601 times, or
-    2014-09-07_22.41.23. Raises ScenarioError.
+    """Return a column of stamps as exact seconds (K,): numbers in the unit of ``_find_unit``, ISO
+    8601 times, or 2014-09-07_22.41.23. Raises ScenarioError.
     """
     base = TimeBase(_find_unit(path, table, name, notes))
     stamps = []
@@ -168,8 +160,8 @@ def find_resolution(stamps: list[Decimal]) -> float:
 
 
 def choose_origin(stamps: list[Decimal], resolution: float) -> Decimal:
-    """Return the stamp of simulated 0: 0 for a log that begins soon after it, else the whole second
-    before the first stamp. Nothing can be sent at 0 itself.
+    """Return the stamp of simulated 0: 0 if the log begins soon after it, else a whole second
+    before the first. Nothing can be sent at 0 itself.
     """
     first, last = min(stamps), max(stamps)
     if 0 < first <= max((last - first) / 10, Decimal(1)):
@@ -209,9 +201,7 @@ def unwrap(numbers: np.ndarray, times: FloatArray) -> tuple[np.ndarray, int, int
 
 
 def spread_equal(sends: pd.DataFrame, resolution: float, notes: list[str]) -> None:
-    """Move transmissions of one sender that have one stamp apart, evenly within the resolution of
-    stamps, in the order of rows: a node sends once at a time.
-    """
+    """Move transmissions of a sender with one stamp apart, within ``resolution`` (s)."""
     key = [sends["sender"], sends["to"], sends["t"]]
     rank, size = sends.groupby(key).cumcount(), sends.groupby(key)["t"].transform("size")
     moved = int((rank > 0).sum())
@@ -224,14 +214,11 @@ def spread_equal(sends: pd.DataFrame, resolution: float, notes: list[str]) -> No
 
 
 def settle(log: PacketLog, hole: float, unreported: str) -> pd.DataFrame:
-    """Return one outcome for each transmission and node that could hear it, as those of a log:
-    columns send, receiver, heard (1, 0, nan), delay, rssi, why (it is not known), in the order of
-    time.
+    """Return the outcome of each transmission at each node that could hear it, by time: columns
+    send, receiver, heard (1, 0, nan), delay, rssi, why (it is not known).
 
-    A node could hear those that the log says it did, or did not, at least once. A transmission
-    without a row is lost, or unknown where ``log.absent`` says so, in a hole of the receiver's log
-    (after ``hole`` packets, see HOLE), and where nobody reported it and ``unreported`` is
-    "unknown".
+    Without a row it is lost, or unknown: where ``log.absent`` says so, in a hole of the receiver's
+    log (after ``hole`` packets), and unreported ones if ``unreported`` is "unknown".
     """
     sends, told = log.sends, log.outcomes
     pairs = told.assign(sender=sends["sender"].to_numpy()[told["send"]])
@@ -263,17 +250,14 @@ def settle(log: PacketLog, hole: float, unreported: str) -> pd.DataFrame:
 
 
 def _sent_all_that_was_heard(sends: pd.DataFrame) -> np.ndarray:
-    """Return flags of transmissions whose sender logged some, and all that anybody heard: what its
-    log does not have was hardly sent.
-    """
+    """Return flags of transmissions whose sender logged all that anybody heard."""
     known = sends[sends["sent"].astype(bool)].groupby("sender")["logged"].all()
     return sends["sender"].map(known).fillna(False).to_numpy(dtype=bool)
 
 
 def _in_holes(log: PacketLog, whole: pd.DataFrame, hole: float) -> np.ndarray:
-    """Return flags of outcomes ``whole`` without a row that lie in a hole of the receiver's log: it
-    reports nothing of two senders or more, of whose packets it would have heard ``hole``, while
-    another receiver reports something.
+    """Return flags of outcomes in a hole of the receiver's log: it reports nothing of two senders
+    or more, of whose packets it would have heard ``hole``, while another reports something.
     """
     sends = log.sends.iloc[whole["send"]]
     rows = pd.DataFrame({"receiver": whole["receiver"], "missing": whole["told"].isna()})

@@ -79,10 +79,8 @@ kind = "diffusion"
 def write_network(
     log: PacketLog, name: str, hole: float, unreported: str, like: Scenario | None
 ) -> tuple[Files, tuple[str, ...]]:
-    """Return the scenario, the tables and the report of a log called ``name``, and notes.
-
-    ``hole`` and ``unreported`` say what an absent row means, see ``settle``; ``like`` is a scenario
-    whose plant, sensors and filter replace those made here. Raises ScenarioError.
+    """Return the files of a log called ``name``, and notes; see ``settle`` for ``hole`` and
+    ``unreported``, ``like`` replaces plant, sensors and filter. Raises ScenarioError.
     """
     rename_nodes(log)
     if like is not None:
@@ -139,9 +137,7 @@ def write_network(
 
 
 def rename_nodes(log: PacketLog) -> None:
-    """Give nodes names that tables can hold: no blanks, quotes or signs of comments, and no numbers
-    but those of ids from 0.
-    """
+    """Give nodes names that tables can hold: no blanks, quotes or signs of comments."""
     nodes = sorted({*log.sends["sender"], *log.outcomes["receiver"]})
     names = {node: re.sub(r"[^\w.:+-]", "_", node) for node in nodes}
     if not all(re.fullmatch(r"\d{1,15}", node) for node in nodes):
@@ -169,9 +165,7 @@ def _is_number(text: str) -> bool:
 
 
 def _outcome_tables(log: PacketLog, outcomes: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return the outcomes that are known, with the number of each message of its direction, and
-    those that are not, with the reason.
-    """
+    """Return the known outcomes, numbered by direction, and the others with the reason."""
     sends = log.sends.iloc[outcomes["send"]].reset_index(drop=True)
     table = pd.DataFrame({"sender": sends["sender"], "receiver": outcomes["receiver"]})
     table["message"] = table.groupby(["sender", "receiver"]).cumcount()
@@ -252,9 +246,7 @@ def _round_number(value: float) -> float:
 
 
 def _fit_walk(readings: pd.DataFrame) -> dict[str, str]:
-    """Return B and R of a random walk by the moments of differences of readings, one and LAG apart,
-    and mean and cov of its start.
-    """
+    """Return B and R of a random walk by moments of differences, and mean and cov of its start."""
     near: list[tuple[float, float]] = []
     far: list[tuple[float, float]] = []
     for _, rows in readings.groupby("node"):
@@ -277,11 +269,7 @@ def _fit_walk(readings: pd.DataFrame) -> dict[str, str]:
 def _scenario_like(
     scenario: Scenario, log: PacketLog, table: pd.DataFrame, channel: dict[str, Any]
 ) -> Files:
-    """Return a ``scenario`` over the network of the log, with the tables that it names.
-
-    Its graph stays, which must have the links of the log; so does what makes nodes send, if they
-    do so after their samples or all of them in every slot.
-    """
+    """Return a ``scenario`` over the network of the log; its graph must have the log's links."""
     known = {(str(i), str(j)) for i, j in scenario.topology.directions}
     for sender, receiver in table[["sender", "receiver"]].drop_duplicates().itertuples(index=False):
         if (sender, receiver) not in known:
@@ -313,8 +301,8 @@ def _scenario_like(
 
 
 def _begin_with(scenario: Scenario, log: PacketLog) -> None:
-    """Count the log's times from [time] origin of the scenario, if it has one, and drop what was
-    sent before; raises ScenarioError if nothing is left. The log of a run counts so already.
+    """Count times from [time] origin of the scenario, and drop what was sent before
+    (ScenarioError).
     """
     if scenario.time.origin is None or log.is_run:
         return
@@ -335,8 +323,8 @@ def _begin_with(scenario: Scenario, log: PacketLog) -> None:
 def _recorded_activation(
     scenario: Scenario, log: PacketLog
 ) -> tuple[dict[str, Any], str | Path] | None:
-    """Return the table network.activation that makes nodes of a scenario send as in the log, and
-    the file that it names; None where nodes send after their samples, or all in every slot.
+    """Return the table network.activation that sends as in the log and its file; None if not
+    needed.
     """
     activation, sends = scenario.network.activation, log.sends
     table: dict[str, Any] = {"kind": "recorded", "path": "transmissions.csv"}

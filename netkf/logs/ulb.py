@@ -30,10 +30,7 @@ EARLY = 10.0
 
 
 def read_ulb(log: Path) -> PacketLog:
-    """Return the packet log of a folder with readings.csv and heard.csv, or heard.csv.gz.
-
-    Raises ScenarioError, with file and line, for a folder that has none.
-    """
+    """Return the packet log of a folder with readings.csv and heard.csv; raises ScenarioError."""
     paths = {}
     for name in ("readings", "heard"):
         found = [log / f"{name}.csv", log / f"{name}.csv.gz"]
@@ -93,9 +90,7 @@ def read_ulb(log: Path) -> PacketLog:
 
 
 def _broadcasts(readings: pd.DataFrame, reports: pd.DataFrame, notes: list[str]) -> pd.DataFrame:
-    """Return a broadcast for each reading, and for each minute in which a mote is named that has no
-    reading in it, at the usual second of the mote.
-    """
+    """Return a broadcast for each reading, and for minutes that name a mote without a reading."""
     minute = (readings["t"] // MINUTE).astype(int)
     sends = pd.DataFrame({"sender": readings["node"], "t": readings["t"], "minute": minute})
     sends = sends.drop_duplicates(["sender", "minute"])
@@ -122,9 +117,7 @@ def _broadcasts(readings: pd.DataFrame, reports: pd.DataFrame, notes: list[str])
 
 
 def _outcomes(sends: pd.DataFrame, reports: pd.DataFrame, notes: list[str]) -> pd.DataFrame:
-    """Return the outcome of each broadcast at each mote whose report of that minute there is; it is
-    not known where there is none.
-    """
+    """Return outcomes of broadcasts at motes; unknown without the report of that minute."""
     pairs = reports[["sender", "receiver"]].drop_duplicates()
     whole = sends[["sender", "minute"]].rename_axis("send").reset_index().merge(pairs, on="sender")
     heard = reports[["sender", "receiver", "minute", "rssi"]].assign(heard=1.0)

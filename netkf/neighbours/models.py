@@ -117,9 +117,7 @@ def _slots(period: Any) -> dict[str, Any]:
 
 
 def _scenario(table: dict[str, Any], H: FloatArray, R: Any, B: Any, changes: Changes) -> Scenario:
-    """Return the scenario of a ``table`` with a plant, whose outputs are ``H x`` (p,) with noise of
-    the covariance ``R`` (p, p), and inputs ``B u``.
-    """
+    """Return the scenario of a ``table`` with outputs ``H x`` of noise ``R``, inputs ``B u``."""
     R = _shaped("R", definite_covariance("R", np.atleast_2d(R)), len(H))
     alone = np.count_nonzero(R - np.diag(np.diag(R))) == 0
     rows = [[k] for k in range(len(H))] if alone else [list(range(len(H)))]

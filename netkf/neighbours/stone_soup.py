@@ -103,9 +103,7 @@ def _detections(run: Run, start: datetime.datetime | None) -> set[Any]:
 
 @cache
 def _model_class() -> Any:
-    """Return a class of Stone Soup's measurement models for any reading: its own pick entries of x,
-    or are of one kind of radar.
-    """
+    """Return a measurement model of Stone Soup for entries of x, or for one kind of radar."""
     base, types = _import("base"), _import("types.array")
     gaussian = _import("models.measurement.nonlinear").NonLinearGaussianMeasurement
 

@@ -50,12 +50,8 @@ FALSE_ALARM = 0.01
 def describe_source(
     source: ReportSource, messages: np.ndarray, readings: Innovations | str | None = None
 ) -> list[str]:
-    """Return the sentences at the top of the page about a source (the contents of one directory):
-    what its data say, the most important first, without full stops.
-
-    ``messages`` are the MESSAGE rows (M,) of its run, one for each of M messages sent, with its
-    outcome; none without a run. ``readings`` are the innovations of the run, or None or the reason
-    why there are none.
+    """Return the sentences on top of the page, the most important first, without full stops, from
+    MESSAGE rows ``messages`` (M,), none without a run, and innovations or the reason for none.
     """
     if source.kind == "sweep":
         return [*_describe_status(source), *_describe_sweep(source)]

@@ -52,13 +52,10 @@ def run_data(
     budget: Budget,
     packer: Packer,
 ) -> dict[str, Any]:
-    """Return the data of a recorded run for the live views, in which the page animates it, as JSON
-    values; its scripts read the keys.
+    """Return the data of a run for the live views as JSON values; columns are added to ``packer``.
 
-    ``messages`` are the MESSAGE rows (M,) of the run, one for each message sent; ``readings`` its
-    innovations or the reason why there are none; ``layout`` the ``positions`` of its nodes;
-    ``budget`` limits the numbers of messages and sample values. Columns of numbers are added to
-    ``packer``, and the data refer to them.
+    ``readings`` are innovations or the reason for none, ``layout`` the positions of nodes;
+    ``budget`` limits the numbers of messages and sample values.
     """
     worst = None if source.worst is None else source.worst.explained
     horizon = float(source.scenario.horizon)
@@ -150,11 +147,8 @@ def thinning_rules(data: dict[str, Any]) -> list[str]:
 
 
 def sample_indices(run: StoredRun, max_values: int, instant: float) -> np.ndarray:
-    """Return the sorted indices (K,) of the K samples of a run that a page holds.
-
-    They are all samples, or if these have more than ``max_values`` numbers every k-th, the last
-    one, the one at ``instant`` (seconds), and that with the largest error of each node, in the
-    order of these errors until they are as many as fit into ``max_values``.
+    """Return the sorted indices (K,) of the samples that a page holds: all, or every k-th, the
+    last, that at ``instant`` (s) and each node's worst, as far as ``max_values`` numbers reach.
     """
     n, count = run.x.shape[1], len(run.nodes)
     # The numbers of a sample: for each node xhat, the upper triangle of P, squared error, NEES,

@@ -86,9 +86,7 @@ class ReportSource:
         return f"{self.label}, replica {self.run.replica}"
 
     def other_runs(self) -> list[ReportSource]:
-        """Return the source with the worst and with the median recorded run of an ensemble, without
-        that which is shown.
-        """
+        """Return the worst and the median recorded run of an ensemble, unless shown."""
         if self.ensemble is None or self.run is None or self.replicas is None:
             return []
         numbers = {int(self.replicas.numbers[self.replicas.place(rank)]) for rank in RANKS}
@@ -138,8 +136,8 @@ class ReportSource:
         return float(self.scenario.slot_plant.period) if self.scenario.slotted else 0.0
 
     def cutoffs(self, times: FloatArray) -> FloatArray:
-        """Return the latest arrival times (T,) of messages that the estimates sampled at ``times``
-        (T,) include, in seconds; ``knowledge`` is the rule.
+        """Return the latest arrivals (T,) that estimates at ``times`` (T,) include, by
+        ``knowledge``.
         """
         knowledge = self.knowledge
         if knowledge == "until":  # under clocks: all that arrived by then
@@ -155,14 +153,10 @@ class ReportSource:
 def read_source(
     directory: Path, replica: int | str | None = None, trust: bool = False
 ) -> ReportSource:
-    """Return the contents of a directory that ``netkf run``, ``sweep``, ``check`` or
-    ``compare-filters`` wrote.
+    """Return the contents of a directory that netkf wrote; raises ScenarioError for another.
 
-    ``replica`` chooses one of the recorded runs of an ensemble, by default the first; it may be
-    ``"worst"`` or ``"median"``, by the RMS error of all nodes. Of runs that
-    were interrupted or failed the part that was written is read. ``trust`` imports classes that
-    the scenario names. Raises ScenarioError if netkf did not write the directory, or if its files
-    were changed since.
+    ``replica`` chooses a recorded run of an ensemble, by number or as ``"worst"`` or ``"median"``
+    by RMS error; of interrupted runs what was written is read. ``trust`` imports classes.
     """
     stored = open_directory(directory, trust=trust)
     label, text = str(directory), (directory / "scenario.toml").read_text(encoding="utf-8")

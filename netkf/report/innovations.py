@@ -109,11 +109,9 @@ def _judge_mean(mean: float, low: float, high: float) -> str:
 def innovation_columns(
     readings: Innovations | str | None, run: StoredRun, max_readings: int, packer: Packer
 ) -> dict[str, Any] | None:
-    """Return the NIS (normalised squared innovations) of the readings for the live views, as
-    columns added to ``packer``, with the means and the autocorrelations of each node; every k-th
-    reading if there are more than ``max_readings``; None without innovations.
-
-    Nodes are given by their index in ``run.nodes``, -1 for readings that one filter uses together.
+    """Return NIS of readings as columns added to ``packer``, means and autocorrelations by node,
+    thinned to ``max_readings``; nodes by index in ``run.nodes``, -1 for all. None without
+    innovations.
     """
     if not isinstance(readings, Innovations):
         return None

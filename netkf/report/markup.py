@@ -36,11 +36,7 @@ def table_box(
     rows: Iterable[Sequence[object]],
     css_class: str = "numbers",
 ) -> str:
-    """Return a table in a box of its own scroll bar, so that the page never scrolls sideways.
-
-    ``header`` has the titles of the columns; the first cell of each of the ``rows`` is its title.
-    ``css_class`` is that of the table in the page's style sheet.
-    """
+    """Return a table that scrolls by itself; the first cell of a row is its title."""
     head = "".join(f'<th scope="col">{text(cell)}</th>' for cell in header)
     lines = []
     for row_title, *cells in rows:

@@ -84,10 +84,8 @@ class CentralSample(NamedTuple):
 
 
 def central_sample(source: ReportSource) -> CentralSample | None:
-    """Return the centralised filter's sample at the time of the worst sample after the start-up.
-
-    It is simulated with the truth and the readings of the run. None without a run in which nodes
-    send messages, or if the scenario does not allow that filter.
+    """Return the centralised filter's sample at the time of the worst sample, with truth and
+    readings of the run; None without messages, or if the scenario does not allow it.
     """
     run = source.run
     if source.worst is None or run is None or not run.scenario.filter.algorithm.timing.talks:

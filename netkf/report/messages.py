@@ -22,11 +22,8 @@ class ThinnedMessages(NamedTuple):
 
 
 def thin_messages(messages: np.ndarray, max_messages: int, instant: float) -> ThinnedMessages:
-    """Return at most about ``max_messages`` of the MESSAGE rows ``messages`` (M,), one for each
-    message of a run, so that the page does not become too large.
-
-    If there are more, half of those returned are all messages of an interval around ``instant``
-    (seconds), and the other half is spread over the run.
+    """Return about ``max_messages`` MESSAGE rows: half of them all around ``instant`` (s), the
+    other half spread over the run.
     """
     if len(messages) <= max_messages:
         return ThinnedMessages(messages, -np.inf, np.inf, 1)
@@ -44,13 +41,8 @@ def thin_messages(messages: np.ndarray, max_messages: int, instant: float) -> Th
 def information_age(
     messages: np.ndarray, nodes: tuple[int, ...], times: FloatArray, cutoffs: FloatArray
 ) -> FloatArray:
-    """Return the age of information (T, N) in seconds of N ``nodes`` at sample ``times`` (T,): the
-    time since the newest delivered message of a link was sent, averaged over the links into a node.
-
-    A sample includes the messages that arrived until its cutoff, ``cutoffs`` (T,) in seconds.
-    Before the first delivery the age is the time since the start; it is nan for a node without
-    incoming links. ``messages`` (M,) are MESSAGE rows, one for each message sent, ordered as by
-    ``join_messages``.
+    """Return the age (T, N) in seconds of the newest delivered message, averaged over links into a
+    node, of samples with ``cutoffs`` (T,); before the first the time since 0, nan without links.
     """
     total = np.zeros((len(times), len(nodes)))
     links = np.zeros(len(nodes))

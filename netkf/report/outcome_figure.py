@@ -80,9 +80,7 @@ def _matrix(values: FloatArray, names: list[str], caption: str) -> str:
 
 
 def _losses_over_time(run: Run, outcomes: Outcomes, down: list[Downtime]) -> str:
-    """Return the share lost in parts of the time as bars, with the times at which nodes were down
-    shaded.
-    """
+    """Return bars of the share lost over time, shaded where nodes were down."""
     horizon = float(run.scenario.horizon)
     bins = np.minimum((outcomes.sent / horizon * WINDOWS).astype(int), WINDOWS - 1)
     sent, lost = (np.bincount(bins, w, WINDOWS) for w in (None, ~outcomes.heard))

@@ -101,14 +101,12 @@ def write_report(
     replica: int | str | None = None,
     trust: bool = False,
 ) -> Path:
-    """Write the page of one directory, or of two side by side, and return its path.
+    """Write the page of one or two directories, by default to ``report.html`` in the first; return
+    its path. The second may be a verdict on the first. ``replica`` and ``trust`` as in
+    ``read_source``.
 
-    The path is ``out``, by default ``report.html`` in the first directory. A second directory may
-    hold the verdict of ``netkf check`` on the first. ``replica`` is the number of the run of an
-    ensemble to show, None for the first; with ``trust`` the classes that scenarios name are also
-    imported from their directories and the current folder, which executes these modules. Raises
-    ScenarioError if netkf did not write a directory or ``out`` is a file other than a page,
-    WriteError if the page cannot be written.
+    Raises ScenarioError for other directories, or if ``out`` is a file other than a page, and
+    WriteError.
     """
     path = Path(directories[0]) / "report.html" if out is None else out
     if out is not None or path.parent.is_dir():
@@ -142,11 +140,8 @@ def make_page(
     trust: bool = False,
     out: Path | None = None,
 ) -> str:
-    """Return the page of one or two directories as HTML.
-
-    ``replica`` chooses the run of an ensemble to show, ``trust`` allows scenarios to import users'
-    modules, and ``out`` is the file to be written, which the command on the page names. Raises
-    ScenarioError if netkf did not write a directory.
+    """Return the page of one or two directories as HTML, see ``write_report``; ``out`` is only
+    named in the command on the page. Raises ScenarioError.
     """
     if not 1 <= len(directories) <= 2:
         raise ScenarioError("report", "takes one or two directories", len(directories))

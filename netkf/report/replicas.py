@@ -73,9 +73,7 @@ def read_replicas(stored: StoredEnsemble) -> Replicas | None:
 def choose_replica(
     stored: StoredEnsemble, found: Replicas | None, replica: int | str | None
 ) -> int | None:
-    """Return the number of the ``replica`` asked for, by number or by rank among those ``found``;
-    raises ScenarioError.
-    """
+    """Return the number of the ``replica`` asked for; raises ScenarioError."""
     if not isinstance(replica, str):
         return replica
     if replica not in RANKS:

@@ -261,11 +261,8 @@ def ensemble_curves(source: ReportSource) -> dict[str, Any] | None:
 
 
 def difference_curves(source_a: ReportSource, source_b: ReportSource) -> dict[str, Any] | None:
-    """Return the difference, B minus A, of the mean squared errors of two ensembles.
-
-    For each node there are three lists over time: the differences and the lower and upper limits of
-    their intervals. None if a source is not an ensemble of two runs or more, or if their nodes or
-    times differ. The intervals are Welch's, and hold together for all nodes and times (Bonferroni).
+    """Return mean squared errors of B minus A over time, by node with limits of Welch's intervals,
+    which hold together; None unless both are ensembles with the same nodes and times.
     """
     first, second = source_a.ensemble, source_b.ensemble
     if first is None or second is None or first.nodes != second.nodes:
@@ -308,10 +305,7 @@ def _interval_curves(mean: Any, error: Any) -> list[list[float | None]]:
 
 
 def filter_curves(source: ReportSource) -> dict[str, Any] | None:
-    """Return the mean square errors over time of compared filters, with the bounds of those that
-    have one, as JSON values; None without errors. ``row`` is that of the filter in the figure of
-    RMS errors.
-    """
+    """Return mean square errors and bounds of compared filters as JSON values; None without."""
     comparison = source.filters
     known = [c for c in comparison.curves if np.isfinite(c.square).any()] if comparison else []
     if comparison is None or not known:
@@ -333,10 +327,8 @@ def filter_curves(source: ReportSource) -> dict[str, Any] | None:
 
 
 def sweep_curves(source: ReportSource) -> dict[str, Any] | None:
-    """Return the worst RMS error of a sweep over its first varied key, as JSON values, with one
-    curve for each combination of values of the other keys.
-
-    None without a finished point, or if the values of the first key are not numbers.
+    """Return the worst RMS error over the first key as JSON values, a curve for each value of the
+    others; None without a finished point, or if the first key has no numbers.
     """
     if source.sweep is None or not len(source.sweep.table):
         return None

@@ -59,9 +59,7 @@ class WorstSamples(NamedTuple):
 
 
 def find_worst_samples(run: StoredRun, summary: Mapping[str, Any]) -> WorstSamples | None:
-    """Return the worst samples of a run, None if no node has a finite mean; ``summary`` is the
-    contents of summary.json.
-    """
+    """Return the worst samples of a run, None if no node has a finite mean."""
     if not len(run.times) or not run.nodes:
         return None
     by_error, averaged = run.truth_known, summary_samples(run, summary)

@@ -152,12 +152,10 @@ class RunDirectory:
 
     @cached_property
     def samples(self) -> pd.DataFrame | None:
-        """Samples after time 0 of all runs, one row per run, time and node; None if the directory
-        does not have them all.
+        """Samples after time 0 of all runs by run, time and node; None if not all were kept.
 
-        Columns are run, t (s), node, sq_error, nees, mean_trace (the trace of P; the name is that
-        of its average), the diagonal of P, and the true states x0, x1, ... Raises ScenarioError if
-        states.parquet is damaged.
+        Columns are run, t (s), node, sq_error, nees, mean_trace (trace of P), the diagonal of P,
+        and the true states x0, x1, ... Raises ScenarioError if states.parquet is damaged.
         """
         file = self.directory / "states.parquet"
         if not file.exists() or self.runs < 2:
@@ -183,11 +181,9 @@ class RunDirectory:
         return math.inf if stored is None else float(stored)
 
     def by_run(self, quantity: str, node: int, end: float) -> pd.Series[float] | None:
-        """Return the average of ``quantity`` over time for each run, indexed by its number, at
-        ``node`` (an id, -1 for all nodes together); None if the states were not kept.
-
-        For ``rms_error`` it is the squared error. Of errors and NEES only samples before ``end``
-        (seconds) count.
+        """Return averages over time by run of a ``quantity`` (of ``rms_error`` the square) at
+        ``node``, -1 for all together; of errors and NEES only samples before ``end`` (s). None
+        without states.
         """
         columns = {"rms_error": "sq_error", "mean_trace": "mean_trace", "mean_nees": "nees"}
         if self.samples is None or quantity not in columns:
@@ -226,9 +222,7 @@ def read_directory(directory: Path) -> RunDirectory:
 
 
 def _leaves(value: Any, path: str) -> Iterator[tuple[str, str]]:
-    """Yield the paths of keys below ``path`` with their values as TOML; entries of lists of tables
-    are numbered, ``sensors.0.R``.
-    """
+    """Yield paths of keys below ``path`` with values as TOML; lists of tables are numbered."""
     if isinstance(value, list) and value and all(isinstance(entry, dict) for entry in value):
         value = {str(k): entry for k, entry in enumerate(value)}
     if not isinstance(value, dict):

@@ -113,9 +113,7 @@ class ComparedFilter:
         return self.quantities["rms_error"]
 
     def document(self, names: Sequence[str]) -> dict[str, Any]:
-        """Return plain values, one level deep: the row of the table with the quantities ``names``,
-        nan where one is missing.
-        """
+        """Return the row of the table with the quantities ``names``, nan where one is missing."""
         row: dict[str, Any] = {"filter": self.filter}
         for name in names:
             quantity = self.quantities.get(name, Quantity(math.nan, math.nan))
@@ -204,61 +202,78 @@ def compare_filters(
     confidence = number(above=0.0, below=1.0)("confidence", confidence)
     count = integer(low=1)("runs", runs)
     root = scenario.seed if seed is None else integer(low=0)("seed", seed)
-    candidates = _candidates(scenario, filters, engine)
-    values: dict[str, FilterValues] = {}
-    traffic: dict[str, dict[str, float]] = {}
-    curves, curve_at = [], curve_rows(scenario, count)
-
-    def simulate(case: Scenario, pool: Pool) -> FilterValues:
-        task = partial(block_values, engine=choose_engine(engine, case), rows=curve_at)
-        with explain_failures(case):
-            found: FilterValues = replicate_blocks(
-                task, join_values, case, count, root, pool=pool, form=VALUES
-            )
-            return found
-
-    able = [(one.label, one.scenario) for one in candidates if one.scenario is not None]
+    entries = _candidates(scenario, filters, engine)
+    able = [entry for entry in entries if entry.scenario is not None]
+    simulated: dict[str, SimulatedFilter] = {}
     with make_pool(count, PoolOptions(workers, executor, scheduler), open_ended=True) as pool:
-        found = results_of(partial(simulate, case, pool) for _, case in able)
-        for (label, able_case), value in zip(able, found, strict=True):
-            if scenario.plant.truth_known:
-                curves.append(mean_curve(label, able_case, value.curves))
-            values[label] = value._replace(curves=np.empty((0, 0)))
-            traffic[label] = count_traffic(
-                able_case, root, choose_engine(engine, able_case, announce=False)
-            )
+        simulate = partial(_simulate, runs=count, seed=root, engine=engine, pool=pool)
+        found = results_of(partial(simulate, entry.scenario) for entry in able)
+        for entry, values in zip(able, found, strict=True):
+            simulated[entry.label] = _summarise(entry, values, root, engine)
             if progress is not None:
-                progress(len(values), len(able))
-    first = next(iter(values))
+                progress(len(simulated), len(able))
     # Bonferroni: all differences from the first filter hold together.
-    names = sample_names(scenario)
-    level = (1.0 - confidence) / (len(JUDGED) * max(1, len(values) - 1))
-    rows, first_scenario = [], next(one.scenario for one in candidates if one.scenario is not None)
-    for label, case, reason in candidates:
-        if case is None:
-            # No quantities, consistency and traffic, but the reason why it cannot run.
-            rows.append(ComparedFilter(label, {}, "-", {}, reason))
-            continue
-        base, n = values[first] if label != first else None, float(scenario.sizes.mean())
-        diverged = int(values[label].diverged.sum())
-        rows.append(
-            ComparedFilter(
-                label,
-                estimate_quantities(values[label], base, n, names, level),
-                credibility(values[label], n, level),
-                traffic[label],
-                f"{diverged} of {count} runs diverged" if diverged else "complete",
-                predicts=case.slotted and case.node_filter.timing.predicts,
-                same_losses=_meet_same_losses(case, first_scenario),
-            )
-        )
+    level = (1.0 - confidence) / (len(JUDGED) * max(1, len(simulated) - 1))
     return FilterComparison(
         scenario=scenario.name,
         runs=count,
         seed=root,
         confidence=confidence,
-        rows=tuple(rows),
-        curves=tuple(curves),
+        rows=tuple(_make_row(scenario, entry, simulated, level) for entry in entries),
+        curves=tuple(one.curve for one in simulated.values() if one.curve is not None),
+    )
+
+
+def _simulate(
+    candidate: Scenario, pool: Pool, *, runs: int, seed: int, engine: str
+) -> FilterValues:
+    task = partial(
+        block_values, engine=choose_engine(engine, candidate), rows=curve_rows(candidate, runs)
+    )
+    with explain_failures(candidate):
+        found: FilterValues = replicate_blocks(
+            task, join_values, candidate, runs, seed, pool=pool, form=VALUES
+        )
+        return found
+
+
+class SimulatedFilter(NamedTuple):
+    """The results of a filter in its ``scenario``: values of its runs without curves, the mean
+    curve of errors (None without ground truth), and the traffic of replica 0.
+    """
+
+    scenario: Scenario
+    values: FilterValues
+    curve: ErrorCurve | None
+    traffic: dict[str, float]
+
+
+def _summarise(entry: FilterEntry, values: FilterValues, seed: int, engine: str) -> SimulatedFilter:
+    scenario = entry.scenario
+    assert scenario is not None
+    truth_known = scenario.plant.truth_known
+    curve = mean_curve(entry.label, scenario, values.curves) if truth_known else None
+    traffic = count_traffic(scenario, seed, choose_engine(engine, scenario, announce=False))
+    return SimulatedFilter(scenario, values._replace(curves=np.empty((0, 0))), curve, traffic)
+
+
+def _make_row(
+    scenario: Scenario, entry: FilterEntry, simulated: Mapping[str, SimulatedFilter], level: float
+) -> ComparedFilter:
+    if entry.scenario is None:
+        # No quantities, consistency and traffic, but the reason why it cannot run.
+        return ComparedFilter(entry.label, {}, "-", {}, entry.reason)
+    own, first = simulated[entry.label], next(iter(simulated.values()))
+    base, n = None if own is first else first.values, float(scenario.sizes.mean())
+    runs, diverged = len(own.values.diverged), int(own.values.diverged.sum())
+    return ComparedFilter(
+        entry.label,
+        estimate_quantities(own.values, base, n, sample_names(scenario), level),
+        credibility(own.values, n, level),
+        own.traffic,
+        f"{diverged} of {runs} runs diverged" if diverged else "complete",
+        predicts=own.scenario.slotted and own.scenario.node_filter.timing.predicts,
+        same_losses=_meet_same_losses(own.scenario, first.scenario),
     )
 
 
@@ -347,7 +362,6 @@ def _differing_settings(filters: Sequence[Any]) -> list[dict[str, str]]:
 
 
 def _make_label(kind: str, settings: Mapping[str, Any]) -> str:
-    """Return the label of a filter: kind and settings."""
     return " ".join([kind, *(f"{key}={value}" for key, value in settings.items())])
 
 
@@ -409,9 +423,7 @@ def write_comparison(
 
 
 def _curve_columns(curves: Sequence[ErrorCurve]) -> dict[str, Any]:
-    """Return a row per filter and time: filter, t, mean square error and its standard error, bound
-    on the mean trace of P and trace of P of the centralised filter, nan where there is none.
-    """
+    """Return columns with a row per filter and time, nan where a filter has no such value."""
     errors = [np.full(len(c.times), np.nan) if c.se is None else c.se for c in curves]
     bounds = [np.full(len(c.times), np.nan) if c.bound is None else c.bound for c in curves]
     return {

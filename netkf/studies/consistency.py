@@ -102,10 +102,7 @@ class RunConsistency(NamedTuple):
 def run_consistency(
     scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto"
 ) -> RunConsistency:
-    """Simulate one ``replica`` of the runs of ``seed``; return NEES (T, K) after time 0 of K blocks
-    as nodes estimate them, and the means over time (K,) of NEES and NIS, with their expected values
-    given the events of the run. A task of ``replicate``.
-    """
+    """Return the consistency of one ``replica`` of the runs of ``seed``; for ``replicate``."""
     blocks, shown = judged_blocks(scenario), scenario.times
     run = simulate(scenario, seed, replica, engine)
     innovations: Any = None
@@ -143,9 +140,7 @@ def run_consistency(
 def _block_consistency(
     run: Run, sigma: FloatArray | None, block: JudgedBlock
 ) -> tuple[FloatArray, FloatArray, np.ndarray]:
-    """Return NEES (T,) of a block, its expected value, and where the error is mostly rounding, by
-    its standard deviation of P or of Sigma.
-    """
+    """Return NEES (T,) of a block, its expected value, and where the error is mostly rounding."""
     own = block.entries
     square = np.ix_(np.arange(len(run.times)), np.array([block.node]), own, own)
     P, covariance = run.P[square], None if sigma is None else sigma[square]
@@ -183,10 +178,7 @@ def _expected_nees(P: FloatArray, sigma: FloatArray | None) -> FloatArray:
 def _mean_nis(
     innovations: Any, blocks: list[JudgedBlock], blurred: np.ndarray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return mean NIS (K,) of the nodes' own readings of each block and its expected value; nan
-    without ``innovations``, as where errors alone do not tell them. Of samples (T, K) that are
-    ``blurred`` nothing is used.
-    """
+    """Return mean NIS (K,) and its expected value, over samples (T, K) that are not ``blurred``."""
     pairs = [
         np.array(list(innovations.of_block(block, blurred[:, k]) if innovations else ()))
         for k, block in enumerate(blocks)
@@ -220,9 +212,7 @@ class _Innovations:
         self._noise = [path.state(slot) for slot in self._slots]
 
     def of_block(self, block: JudgedBlock, blurred: np.ndarray) -> Iterator[tuple[float, float]]:
-        """Yield NIS of the linear readings of a block and its expected value (nan: unknown), but
-        for samples (T,) that are ``blurred``.
-        """
+        """Yield NIS of a block and its expected value, without ``blurred`` samples (T,)."""
         scenario, i, placed = self._scenario, block.node, readings_of_block(self._scenario, block)
         # A nonlinear reading has no H given the errors alone.
         if not placed or not scenario.is_linear:
@@ -243,9 +233,7 @@ class _Innovations:
     def _prediction(
         self, k: int, i: int, last: tuple[int, FloatArray] | None
     ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-        """Return error (n,), P (n, n) and E[e e'] of sample k, or of its prediction by one slot:
-        ``last``, its number and the noise of the plant in it.
-        """
+        """Return error, P and E[e e'] of sample k, or of its prediction over the ``last`` slot."""
         run, scenario = self._run, self._scenario
         own = scenario.is_estimated[i]
         square = np.ix_(own, own)
@@ -453,9 +441,7 @@ def _judge_block(
     level: float,
     means: FloatArray,
 ) -> NodeConsistency:
-    """Return the row of a block and its number, whose interval misses by chance ``level``;
-    ``means`` (T,) are NEES over the runs.
-    """
+    """Return the row of a numbered block, with NEES over the runs ``means`` (T,)."""
     i, block = judged
     n = len(block.entries)
     nees = np.array([run.nees[i] for run in runs])
@@ -491,9 +477,7 @@ def _judge_block(
 
 
 def _tell_since(scenario: Scenario, ratios: FloatArray, freedom: int) -> str:
-    """Return since when, and until when, ratios (T,) of NEES to what it should be are not near 1;
-    empty if always.
-    """
+    """Return since and until when ``ratios`` (T,) of NEES are off; empty if always."""
     times, known = scenario.times[scenario.times > 0.0][: len(ratios)], np.isfinite(ratios)
     if not known.any():
         return ""
@@ -506,9 +490,7 @@ def _tell_since(scenario: Scenario, ratios: FloatArray, freedom: int) -> str:
 def _verdict(
     scenario: Scenario, n: int, interval: tuple[float, float], expected: float | None
 ) -> str:
-    """Return the verdict on NEES of n states that is by an ``interval``, centre and half width,
-    above ``expected`` (None: n).
-    """
+    """Return the verdict on NEES whose excess has an ``interval``: centre and half width."""
     excess, width = interval
     if not math.isfinite(excess):
         return "no NEES: P is singular, or P or the errors are not finite"

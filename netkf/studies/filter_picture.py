@@ -28,9 +28,7 @@ PANELS = (
 
 
 def filter_picture(scenario: Scenario, completed: CompletedComparison) -> None:
-    """Write ``filters.png``: errors, consistency and traffic of the filters that ran, and
-    ``errors.png``: their mean square errors over time.
-    """
+    """Write ``filters.png`` (errors, consistency, traffic) and ``errors.png`` (over time)."""
     rows = [row for row in completed.comparison.rows if row.ran]
     with style_context():
         figure = new_figure(9.6, 1.7 + 0.34 * len(rows))

@@ -58,9 +58,7 @@ def curve_rows(scenario: Scenario, runs: int) -> np.ndarray:
 
 
 def mean_curve(label: str, scenario: Scenario, curves: FloatArray) -> ErrorCurve:
-    """Return the mean over runs of ``curves`` (R, K), with its standard error, and what theory
-    gives to compare it with.
-    """
+    """Return the mean over runs of ``curves`` (R, K), its standard error, and what theory gives."""
     runs, times = len(curves), scenario.times[curve_rows(scenario, len(curves))]
     error = curves.std(axis=0, ddof=1) / math.sqrt(runs) if runs > 1 else None
     promised = promise_traces(scenario, times)
@@ -71,9 +69,7 @@ def mean_curve(label: str, scenario: Scenario, curves: FloatArray) -> ErrorCurve
 def block_values(
     scenario: Scenario, seed: int, replicas: range, engine: Engine, rows: np.ndarray
 ) -> FilterValues:
-    """Simulate ``replicas`` of ``seed`` and return their values, curves at the samples ``rows``;
-    for ``replicate_blocks``.
-    """
+    """Return values of ``replicas``, curves at the samples ``rows``; for ``replicate_blocks``."""
     parts = []
     for batch in engine.run_many(scenario, seed, replicas):
         values = run_values(batch, scenario)
@@ -120,9 +116,8 @@ def estimate_quantities(
     names: Sequence[str],
     level: float,
 ) -> dict[str, Quantity]:
-    """Return ``rms_error``, ``nees_ratio`` (NEES / n) and the quantities of samples, ``names``, of
-    a filter of n states, of all nodes, with the paired differences from the ``first`` one; those of
-    JUDGED have intervals, each of which misses with probability ``level``.
+    """Return ``rms_error``, ``nees_ratio`` and the quantities of samples, ``names``, of a filter of
+    n states, with paired differences from the ``first``; intervals of JUDGED miss with ``level``.
     """
     quantities = {}
     base = _influences(first, n, names) if first is not None else {}
@@ -166,9 +161,8 @@ def _width(values: FloatArray, level: float) -> float:
 
 
 def credibility(values: FilterValues, n: float, level: float) -> str:
-    """Return whether P fits the errors of a filter: "overconfident", "conservative" or
-    "consistent", as the interval of NEES / n, which misses with probability ``level``, lies
-    above, below or around 1; "-" where NEES is unknown or one run shows nothing.
+    """Return "overconfident", "conservative" or "consistent", as the interval of NEES / n lies
+    above, below or around 1; "-" if NEES is unknown, or of one run.
     """
     ratios = values.nees / n
     if len(ratios) < 2 or not np.isfinite(ratios).all():

@@ -20,9 +20,8 @@ BEYOND = "no exchange of messages reaches the limit, better readings may"
 
 
 def describe_help(scenario: Scenario, target: Target, searched: str) -> str:
-    """Return a sentence on the centralised filter in ``scenario``, and which key other than
-    ``searched`` would change the quantity of the ``target`` most, by theory; empty if theory knows
-    neither.
+    """Return a sentence on the centralised filter, and which key other than ``searched`` would
+    change the quantity of the ``target`` most, by theory; empty if theory knows neither.
     """
     if target.of_runs:
         return ""
@@ -46,9 +45,7 @@ def describe_help(scenario: Scenario, target: Target, searched: str) -> str:
 
 
 def _changes(scenario: Scenario, target: Target, searched: str) -> list[tuple[float, str, str]]:
-    """Return for keys that are changed by STEP the ratio of the quantity after to before, the key
-    and the value.
-    """
+    """Return for keys changed by STEP the ratio of the quantity to before, the key and value."""
     try:
         before = quantity_by_theory(scenario, target)[0]
     except NetkfError:

@@ -72,13 +72,10 @@ class Messages:
 
 
 def match_messages(log: IntArray, swaps: bool, slotted: bool) -> Messages:
-    """Return the M messages of an EVENT ``log`` (E,): when each was sent, arrived and used, or why
-    it was not used. The log must begin with the run, so that the messages of each directed link
-    have the numbers 0, 1, ...
+    """Return the M messages of an EVENT ``log`` (E,) that begins with the run.
 
-    With ``swaps`` a receiver uses one message of an instant only, that of the sender with the
-    largest id. A message with a ``late`` event was too late if the run is ``slotted``, else
-    refused.
+    With ``swaps`` a receiver uses of an instant only the message of the sender with the largest id.
+    A message with a ``late`` event was too late if the run is ``slotted``, else refused.
     """
     joined = join_messages(log)
     used_row = np.full(len(joined), NEVER)
@@ -121,11 +118,9 @@ def _next_use(log: IntArray, rows: IntArray) -> IntArray:
 
 
 def at_once(messages: Messages, log: IntArray) -> Messages:
-    """Return ``messages`` for a search of what would have reached a node had all been used: those
-    that were not used are taken to be used when they were sent, in the EVENT ``log`` (E,). Only
-    ``used_row`` differs.
+    """Return ``messages`` as if unused ones were used when they were sent: ``used_row`` differs.
 
-    The time at which they would have arrived is unknown; so ages found with these are lower bounds.
+    When they would have arrived is unknown; so ages found with these are lower bounds.
     """
     # The last row of the instant of sending.
     last = np.searchsorted(log["t"], messages.sent, side="right") - 1
@@ -173,12 +168,10 @@ class Flow:
 def find_flow(
     scenario: DerivedScenario, log: IntArray, messages: Messages, used: IntArray | None = None
 ) -> Flow:
-    """Return the flow of information in an EVENT ``log`` (E,): segments, in each of which the
-    information of one node accumulates, joined by the M ``messages``.
+    """Return the flow of information in an EVENT ``log`` (E,), for ``search_back``.
 
-    ``search_back`` follows it backwards. ``used`` (M,) bool marks the messages of cost 0: those
-    that were used in the original run, of which the log may be a replay; by default those used in
-    this log. Others cost 1, so that a search can count how many missing messages a path needs.
+    ``used`` (M,) marks the messages of cost 0, those used in the original run, of which the log may
+    be a replay (default: in this log); others cost 1, which counts the missing ones of a path.
     """
     used = messages.outcome == USED if used is None else used
     nodes = np.array(scenario.nodes)
@@ -259,11 +252,8 @@ class Reach:
     via: IntArray
 
     def messages_from(self, segment: int, budget: int) -> list[int]:
-        """Return the indices of the messages on the path from ``segment`` (its index) to the node
-        of the search, in the order of sending, if at most ``budget`` messages of cost 1 are used.
-
-        A segment is an interval of the log in which one node's information accumulates. A message
-        that the run did not use (lost, late) costs 1, a used one 0.
+        """Return the messages (indices) on the path from ``segment`` to the node, in the order of
+        sending, if at most ``budget`` of them were not used in the run.
         """
         path: list[int] = []
         while self.via[budget, segment] != NEVER:
@@ -285,12 +275,7 @@ class Reach:
 
 def search_back(flow: Flow, node: int, budget: int = 0) -> Reach:
     """Search from ``node`` (its id) at the end of the log backwards for the information that can
-    have reached it, along messages of cost 0 (used in the run) and at most ``budget`` others.
-
-    The result has for each of 0 .. ``budget`` others and each of the G segments of the flow
-    (intervals of the log in which one node's information accumulates) the row of the log before
-    which information in the segment reaches the node, its deadline, and the first message of the
-    path.
+    have reached it, along used messages and at most ``budget`` others.
     """
     segments = len(flow.node)
     deadline = [[NEVER] * segments for _ in range(budget + 1)]

@@ -73,9 +73,7 @@ def ljung_box(values: FloatArray, lags: int) -> float:
 
 
 def whiteness_p(columns: list[FloatArray], lags: int, level: float) -> tuple[float, float]:
-    """Return the sum of Ljung and Box's statistics of independent ``columns`` and its p. Chi-square
-    has too thin a tail for few readings: what it rejects at ``level`` is compared with shuffles.
-    """
+    """Return the sum of Ljung and Box's statistics of independent ``columns``, and its p."""
     total, freedom = sum(ljung_box(column, lags) for column in columns), lags * len(columns)
     p = float(gammaincc(0.5 * freedom, 0.5 * total))
     if not level**3 < p < level:
@@ -94,9 +92,8 @@ def whiteness_p(columns: list[FloatArray], lags: int, level: float) -> tuple[flo
 
 
 def find_stretch(nis: FloatArray, rows: np.ndarray, sums: FloatArray) -> Stretch:
-    """Return the stretch of M readings that differs most: by the likelihood of another variance, or
-    of another mean, in it. ``nis`` (M,) are chi-square with ``rows`` (M,) degrees of freedom if
-    nothing changes, ``sums`` (M,) normal with variance ``rows``.
+    """Return the stretch of M readings that differs most. Without one ``nis`` (M,) are chi-square
+    with ``rows`` (M,) degrees of freedom, and ``sums`` (M,) normal with variance ``rows``.
     """
     ends = np.unique(np.linspace(0, len(nis), min(STRETCHES, len(nis)) + 1).astype(int))
     cumulated = [np.append(0.0, np.cumsum(values))[ends] for values in (nis, rows, sums)]
@@ -195,9 +192,7 @@ def innovations(run: Run | Scenario, confidence: float = 0.99) -> InnovationTest
 
 
 def recorded_innovations(run: Run) -> Innovations:
-    """Return the innovations of a run; those of a linear central filter by the nodes of readings.
-    Raises NetkfError without any.
-    """
+    """Return the innovations of a run; raises NetkfError without any."""
     scenario = run.scenario
     if type(scenario.node_filter) is Central and scenario.is_linear:
         try:
@@ -243,9 +238,7 @@ def judge_innovations(
 def _judge_node(
     scenario: Scenario, recorded: Innovations, chosen: np.ndarray, law: Law, level: float
 ) -> NodeInnovations:
-    """Return the row of the node of the ``chosen`` readings, each of whose tests rejects a right
-    model with probability ``level``.
-    """
+    """Return the row of the node of ``chosen`` readings, with tests at ``level``."""
     node = int(recorded.nodes[chosen[0]])
     nis, rows, is_white = recorded.nis[chosen], recorded.rows[chosen], law.kind == "white"
     freedom, mean = float(rows.sum()), float(nis.sum() / rows.sum())
@@ -291,9 +284,7 @@ def _judge_node(
 
 
 def _ends_of(stretch: Stretch, times: FloatArray) -> tuple[float, float]:
-    """Return when a stretch of the readings of ``times`` (M,) begins and ends, seconds; nan where
-    it begins with the first or ends with the last.
-    """
+    """Return when a stretch begins and ends (s), nan where the readings do."""
     since = float(times[stretch.first]) if stretch.first else math.nan
     return since, float(times[stretch.end - 1]) if stretch.end < len(times) else math.nan
 
@@ -309,11 +300,7 @@ def _unbroken(law: Law, counted: float, is_small: bool) -> str:
 
 
 def _inflation(columns: list[FloatArray]) -> float:
-    """Return by how much autocorrelation increases the variance of the sum of a series, the largest
-    of ``columns``: 1 + 2 sum r_k up to the first r_k that is negative (Geyer, Stat. Sci. 7, 1992),
-    and a little more, since r_k of few values are too small. It is inf where fewer than
-    MIN_INDEPENDENT readings would be left. That of the sum of squares is smaller.
-    """
+    """Return by how much autocorrelation increases the variance of the sum of a series, at most."""
     largest = 1.0
     for column in columns:
         r = autocorrelation(column - column.mean(), max(1, len(column) // 4))
@@ -327,9 +314,7 @@ def _inflation(columns: list[FloatArray]) -> float:
 def _bias(
     recorded: Innovations, chosen: np.ndarray, inflation: float, level: float
 ) -> tuple[float, float, float, int]:
-    """Return the bias of the component that stands out most, how far it may be from 0, what is
-    found with probability POWER, and the component; ``inflation`` is that of the variance.
-    """
+    """Return the largest bias, how far from 0 it may be, what POWER finds, and the component."""
     best = math.nan, math.inf, math.nan, 0
     count = int(recorded.rows[chosen].max())
     for c in range(count):
@@ -348,10 +333,7 @@ def _bias(
 
 
 def _detectable_correlation(count: int, freedom: int, level: float) -> float:
-    """Return the correlation at one lag that Ljung and Box's test of so many values rejects at
-    ``level`` with probability POWER: its square times ``count`` is the noncentrality. Shuffles
-    reject what chi-square does at a tenth of the level.
-    """
+    """Return the correlation at one lag that Ljung and Box's test finds with probability POWER."""
     critical = 2.0 * float(gammaincinv(0.5 * freedom, 1.0 - 0.1 * level))
     return min(1.0, math.sqrt(float(chndtrinc(critical, freedom, 1.0 - POWER)) / count))
 

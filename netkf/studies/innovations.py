@@ -39,9 +39,7 @@ Row = tuple[FloatArray, ...]
 def nis_of(
     readings: Sequence[Row], view: Any, predicted: tuple[FloatArray, FloatArray, Any]
 ) -> tuple[float, float]:
-    """Return NIS of ``readings`` and its expected value (nan: unknown), from the error, P and E[e
-    e'] (None: unknown) of the prediction of the states of a ``view``.
-    """
+    """Return NIS of ``readings`` and its expected value, by error, P and E[e e'] ``predicted``."""
     parts, (e, P, Sigma) = list(zip(*readings, strict=True)), predicted
     H, (believed, R) = np.concatenate(parts[0])[:, view], map(block_diagonal, parts[2:])
     # The innovation: sensors read the error in place of the state.
@@ -71,9 +69,7 @@ def readings_of_block(scenario: Scenario, block: JudgedBlock) -> tuple[Any, ...]
 
 
 def has_clocked_innovations(scenario: Scenario) -> bool:
-    """Return True if innovations under clocks follow from states at events: of samples alone, and
-    of a linear plant that does not change and whose matrices filters know.
-    """
+    """Return True if innovations under clocks follow from states at events."""
     if scenario.slotted or not scenario.is_linear or scenario.increment_sensors:
         return False
     plant: Any = scenario.plant
@@ -112,9 +108,7 @@ class ClockedInnovations:
         self.times = np.unique(np.concatenate(parts))
 
     def of_block(self, block: JudgedBlock, blurred: np.ndarray) -> Iterator[tuple[float, float]]:
-        """Yield NIS of the samples of a block and its expected value (nan: unknown), but for those
-        whose prediction begins at a sample of the run (T,) that is ``blurred``.
-        """
+        """Yield NIS of a block and its expected value, without ``blurred`` predictions (T,)."""
         scenario, run, i, readings = self._scenario, self.run, block.node, self._readings(block)
         x, view, own = run.x, scenario.view(i), scenario.is_estimated[i]
         if scenario.knows_input:
@@ -134,7 +128,6 @@ class ClockedInnovations:
             yield nis_of(readings[time], view, (e, P, Sigma))
 
     def _readings(self, block: JudgedBlock) -> dict[float, list[Row]]:
-        """Return by time what each sensor reads of a block."""
         scenario, found = self._scenario, dict[float, list[Row]]()
         node, zero = scenario.nodes[block.node], np.zeros(scenario.plant.n)
         for placed in readings_of_block(scenario, block):

@@ -164,9 +164,7 @@ class CentralModel:
         self._parts = np.stack(noises, axis=1)
 
     def innovations(self, factors: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return innovations (M,) of scalar readings in units of their noise, and the variances of
-        these, with the variances of the scenario times ``factors`` (J,).
-        """
+        """Return innovations (M,) in units of the noise, and their variances, by ``factors``."""
         plant = sum(v.Q is not None for v in self.variances)
         weights = np.append(factors[:plant], 1.0)
         Q = np.ascontiguousarray(np.einsum("j,ljab->lab", weights, self._parts))
@@ -197,7 +195,6 @@ class CentralModel:
 
 
 def _require_central(scenario: Scenario) -> None:
-    """Raise ScenarioError unless the central filter is a Kalman filter with one model."""
     plant, leave_out = scenario.plant, "leave it out"
     increments = "must take samples: increments have no density of their own"
     for wrong, key, rule, remedy in (
@@ -222,7 +219,6 @@ def believed_noise(scenario: Scenario) -> FloatArray:
 
 
 def _accumulate(F: FloatArray, Q: FloatArray, slots: int) -> FloatArray:
-    """Return the covariance (n, n) of the noise of so many slots."""
     total = np.zeros_like(Q)
     for _ in range(slots):
         total = F @ total @ F.T + Q
@@ -230,9 +226,7 @@ def _accumulate(F: FloatArray, Q: FloatArray, slots: int) -> FloatArray:
 
 
 def _plant_variances(scenario: Scenario) -> Iterator[Variance]:
-    """Yield the variances of the plant: those of the columns of B, in slots the diagonal of Q, or
-    its trace if it is not diagonal. Nodes whose blocks have one name share them.
-    """
+    """Yield the variances of columns of B, in slots the diagonal of Q or its trace, by block."""
     noise, n = believed_noise(scenario), scenario.plant.n
     groups: dict[tuple[str, str], list[tuple[FloatArray, int]]] = {}
     for place in scenario.layout.places:
@@ -259,9 +253,7 @@ def _plant_variances(scenario: Scenario) -> Iterator[Variance]:
 
 
 def _sensor_variances(scenario: Scenario) -> Iterator[Variance]:
-    """Yield the diagonal of R of each entry of ``[[sensors]]`` whose table brings no noise of its
-    own, or its trace if R is not diagonal.
-    """
+    """Yield the diagonal of R, or its trace, of each ``[[sensors]]`` entry that states it."""
     seen = set()
     for placed in itertools.chain.from_iterable(scenario.placed_sensors.values()):
         entry, sensor = scenario.sensor_entries[placed.entry], scenario.sensors[placed.entry]
@@ -364,9 +356,7 @@ def fit_noise(
 
 
 def _climb(value: Callable[[FloatArray], float], start: FloatArray) -> FloatArray:
-    """Return the logarithms (J,) of the factors of variances at a maximum of ``value``, from
-    ``start`` (J,): by a quasi-Newton method, and at last by Newton's.
-    """
+    """Return logarithms (J,) of factors at a maximum of ``value``, from ``start`` (J,)."""
 
     def loss(theta: Any) -> float:
         return -max(value(np.exp(theta)), -1e300)
@@ -405,9 +395,7 @@ def _hessian(loss: Callable[[FloatArray], float], theta: FloatArray) -> FloatArr
 def _deviations(
     value: Callable[[FloatArray], float], factors: FloatArray, free: np.ndarray
 ) -> FloatArray:
-    """Return standard errors (J,) of the logarithms of factors, nan for those that are not
-    ``free``.
-    """
+    """Return standard errors (J,) of logarithms of factors, nan for those that are not ``free``."""
 
     def loss(theta: FloatArray) -> float:
         whole = factors.copy()

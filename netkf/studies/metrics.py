@@ -75,11 +75,8 @@ def join_metrics(*parts: RunMetrics) -> RunMetrics:
 
 
 def expected_metrics(scenario: Scenario, seed: int, replica: int, engine: Engine) -> RunMetrics:
-    """Simulate one ``replica`` of the runs of ``seed`` and return its metrics, in which the squared
-    error is replaced by its exact expectation given the events of the run.
-
-    The conditional expectation removes the variance that the noises cause (Rao-Blackwell), so that
-    far fewer runs are enough.
+    """Return the metrics of one ``replica`` with squared errors replaced by their exact
+    expectations given the events of the run (Rao-Blackwell), so that far fewer runs are enough.
     """
     run = simulate(scenario, seed, replica, engine)
     if run.status != "complete":
@@ -149,11 +146,8 @@ def time_average(scenario: Scenario, values: FloatArray) -> FloatArray:
 
 
 def bound_traces(scenario: Scenario) -> FloatArray:
-    """Return the traces (N,) of the bound on the mean of each node's P, averaged over the samples
-    after time 0.
-
-    In continuous time it is the bound of the hybrid paper, H equation (12); in slots the covariance
-    itself, if nodes do not exchange anything. Raises TheoryError if there is none.
+    """Return the traces (N,) of the bound on the mean of each node's P, averaged over time: H (12)
+    in continuous time, P itself in slots without exchange. Raises TheoryError for others.
     """
     if not scenario.slotted:
         bound = covariance_bound(scenario, scenario.times)
@@ -174,11 +168,8 @@ def bound_traces(scenario: Scenario) -> FloatArray:
 
 
 def central_trace(scenario: Scenario) -> float:
-    """Return the trace of the covariance of a filter with all readings and the true model, of the
-    states that nodes estimate, averaged over the nodes.
-
-    It is averaged over the samples after time 0, and that of the prediction if the scenario's
-    filter predicts. Raises TheoryError if readings are recorded or H is random.
+    """Return the trace of P of a filter with all readings and the true model, averaged over time
+    and over what nodes estimate. Raises TheoryError if readings are recorded or H is random.
     """
     algorithm = Central()
     central = dataclasses.replace(scenario, filter=Filtering(algorithm=algorithm))
@@ -204,9 +195,7 @@ def _require_fixed_H(scenario: Scenario) -> None:
 def _slot_covariances(
     scenario: Scenario, entity: int, start: FloatArray, pieces: Sequence[Any] = ()
 ) -> FloatArray:
-    """Return P (T, n, n) of a Kalman filter in slots from P(0) = ``start``, of the node
-    with an index in the models of all ``pieces``, by default those of the scenario.
-    """
+    """Return P (T, n, n) of a Kalman filter with the models of an ``entity``, from ``start``."""
     predicts = scenario.filter.algorithm.timing.predicts
     models: list[SlotModel] = [piece[entity] for piece in pieces or scenario.model_pieces]
     # At most n rows with the same information: a central filter may read hundreds.

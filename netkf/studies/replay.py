@@ -89,11 +89,9 @@ class Replayer:
         return self._replay(None, to_horizon=False)
 
     def outcome(self, chosen: Iterable[MessageKey] | None = (), error: bool = False) -> Outcome:
-        """Return the node's state at ``at`` in a replay with the ``chosen`` messages delivered
-        whatever was drawn, all messages for None; cached.
+        """Return the node's state at ``at`` with the ``chosen`` messages delivered, all for None.
 
-        ``error`` asks for the error x - xhat too, which may take a replay of the whole run; without
-        it the error may not be that of the run.
+        Without ``error``, which may replay the whole run, x - xhat may not be that of the run.
         """
         keys = None if chosen is None else frozenset(chosen)
         # The true state between two samples of sensors depends on the later one too.

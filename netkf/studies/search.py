@@ -152,11 +152,8 @@ class Search:
         return self.scenario.replace({self.key: value})
 
     def run(self, low: float, high: float, confidence: float, quantity: str) -> Sizing:
-        """Try values of the key between ``low`` and ``high``, by bisection, and return the smallest
-        (or largest) one that reaches the target, with all that were tried.
-
-        All decisions together hold with probability ``confidence``; ``quantity`` describes the
-        quantity.
+        """Bisect between ``low`` and ``high`` for the smallest (or largest) value that reaches the
+        target; all decisions together hold with probability ``confidence``.
         """
         first, last = self._probe(low), self._probe(high)
         ends = [first, last]
@@ -198,7 +195,6 @@ class Search:
         return described and f"at {self.key} = {value:g} {described}"
 
     def _bisect(self, value: float, misses: float) -> tuple[float, float]:
-        """Return neighbouring values between ``value``, which meets the target, and ``misses``."""
         while len(self.probes) < MAX_PROBES[self.by]:
             middle = self._value_between(*sorted((value, misses)))
             if middle is None:

@@ -57,9 +57,8 @@ class StoredComparison(FilterComparison):
 
 
 def read_comparison(directory: Path, base: Scenario, manifest: dict[str, Any]) -> StoredComparison:
-    """Return the comparison that ``netkf compare-filters`` left in a directory; the caller has
-    checked that the ``manifest`` has the keys of those of runs. ``base`` is the scenario that the
-    filters ran in. Raises DamagedError for files that are not as netkf writes them.
+    """Return the comparison in a directory whose ``manifest`` has the keys of those of runs;
+    ``base`` is the scenario that the filters ran in. Raises DamagedError.
     """
     require_form(manifest, COMPARISON)
     _require_confidence(manifest)

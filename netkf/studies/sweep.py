@@ -216,12 +216,11 @@ def sweep_to_directory(
 
     out      : directory, new or empty; None: the first free runs/NAME-sweep-k
     progress : called with the numbers of points done and of all points after each point
-    take     : called with a complete sweep before its files are written, so that the caller has
-               its table even if writing fails
+    take     : called with a complete sweep before its files are written, which may fail
     finish   : adds its files to the directory before the manifest says that the sweep is complete
 
-    A sweep that is interrupted keeps the rows that it had. Raises ScenarioError and WriteError
-    before anything runs, InterruptedRunError when interrupted.
+    An interrupted sweep keeps its rows. Raises ScenarioError and WriteError before anything runs,
+    InterruptedRunError when interrupted.
     """
     import pandas as pd
 

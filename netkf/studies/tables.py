@@ -103,8 +103,7 @@ def format_answer(sizing: Sizing) -> str:
 
 
 def format_consistency(consistency: Consistency, full: bool = True) -> str:
-    """Return the result of ``netkf.consistency`` for a terminal: one row per node, or block of a
-    node, with NEES and NIS beside their expected values, and a legend of the columns.
+    """Return a row per node, or block of a node, and a legend of the columns.
 
     Unless ``full``, a large network has rows for the nodes whose P is inconsistent, and for the
     first and last of the others.
@@ -221,17 +220,7 @@ def format_comparison(comparison: Comparison) -> str:
             numbered, comparison.directories, comparison.names, comparison.runs, strict=True
         )
     ]
-    differing = [
-        [shorten(key, 60), *(shorten(value, MAX_LENGTH) for value in values)]
-        for key, values in comparison.settings
-    ]
-    if len(differing) > MAX_ROWS // 2:
-        left_out = f"({len(differing) - MAX_ROWS // 2} more; --json has all)"
-        differing[MAX_ROWS // 2 :] = [[left_out, *[""] * len(numbered)]]
-    if differing:
-        lines += ["", format_table(["key that differs", *numbered], differing, left_columns=1)]
-    elif len(numbered) > 1:
-        lines += ["", "the scenarios have the same keys"]
+    lines += _setting_lines(comparison, numbered)
     rows = [
         [
             row.quantity if row.node < 0 else f"{row.quantity} of node {row.node}",
@@ -240,27 +229,38 @@ def format_comparison(comparison: Comparison) -> str:
         for row in comparison.rows
     ]
     if len(rows) > MAX_ROWS:
-        left_out = f"({len(rows) - MAX_ROWS} more; --json has all)"
-        rows = [*rows[: MAX_ROWS - 3], [left_out, *[""] * len(numbered)], *rows[-3:]]
+        rows = [*rows[: MAX_ROWS - 3], _rest_row(len(rows) - MAX_ROWS, numbered), *rows[-3:]]
     lines += ["", format_table(["", *numbered], rows, left_columns=1)]
-    notes = [
+    notes = [f"note: {remark}" for remark in comparison.remarks()]
+    notes += [
         f"note: {mark} {shorten(note, 500)}"
         for mark, texts in zip(numbered, comparison.notes, strict=True)
         for note in texts
     ]
-    notes[:0] = [f"note: {remark}" for remark in comparison.remarks()]
     lines += ["", *notes] if notes else []
     methods = {e.method for row in comparison.rows for e in row.entries if e.method}
-    if methods - {"one run"}:
-        method_names = ", ".join(sorted(methods - {"one run"}))
-        lines += [
-            "",
-            f"* differs from (1) for certain; all marks together at confidence "
-            f"{comparison.confidence:g} ({method_names})",
-        ]
+    intervals = ", ".join(sorted(methods - {"one run"}))
+    if intervals:
+        together = f"all marks together at confidence {comparison.confidence:g} ({intervals})"
+        lines += ["", f"* differs from (1) for certain; {together}"]
     if "one run" in methods:
-        lines += [
-            "",
-            "differences of single runs are not marked: they may be chance",
-        ]
+        lines += ["", "differences of single runs are not marked: they may be chance"]
     return "\n".join(lines)
+
+
+def _setting_lines(comparison: Comparison, numbered: list[str]) -> list[str]:
+    """Return the table of the keys in which scenarios differ, after an empty line."""
+    differing = [
+        [shorten(key, 60), *(shorten(value, MAX_LENGTH) for value in values)]
+        for key, values in comparison.settings
+    ]
+    most = MAX_ROWS // 2
+    if len(differing) > most:
+        differing[most:] = [_rest_row(len(differing) - most, numbered)]
+    if differing:
+        return ["", format_table(["key that differs", *numbered], differing, left_columns=1)]
+    return ["", "the scenarios have the same keys"] if len(numbered) > 1 else []
+
+
+def _rest_row(count: int, numbered: list[str]) -> list[str]:
+    return [f"({count} more; --json has all)", *[""] * len(numbered)]

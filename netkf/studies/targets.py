@@ -129,10 +129,8 @@ def parse_target(text: Any) -> Target:
 
 
 def quantity_by_theory(scenario: Scenario, target: Target) -> tuple[float, str]:
-    """Return an upper bound on the quantity of the target, or the quantity itself, for ``scenario``
-    without simulation, and a text for the user that says which of the two it is, and why.
-
-    Raises TheoryError if theory has no answer.
+    """Return an upper bound on the quantity of the target, or the quantity itself, and a text that
+    says which of the two it is, and why. Raises TheoryError if theory has no answer.
     """
     if target.of_runs:
         raise TheoryError(f"theory knows no {target.quantity}")
@@ -175,12 +173,11 @@ def quantity_by_simulation(
     central: float | None,
     names: Sequence[str] = (),
 ) -> QuantityInterval:
-    """Return the quantity of the target over the runs of ``metrics``, with an interval that misses
-    its true value with probability ``level``.
+    """Return the quantity over the runs of ``metrics``, with Student's interval (of the worst node
+    for all nodes, Bonferroni) that misses its true value with probability ``level``.
 
-    The interval is Student's, simultaneous for all nodes (Bonferroni) if the target is about the
-    worst node. ``central`` is the trace of P of the centralised filter to divide by, or None;
-    ``names`` are those of ``metrics.quantities``.
+    ``central`` is the trace of P of the centralised filter to divide by, or None; ``names`` are
+    those of ``metrics.quantities``.
     """
     if target.of_runs:
         values = metrics.quantities[:, [names.index(target.quantity)]]

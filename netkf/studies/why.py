@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,7 +13,6 @@ from netkf.core.fields import integer, number
 from netkf.core.printable import shorten
 from netkf.ensembles.stored import StoredEnsemble
 from netkf.network.deliveries import MessageKey
-from netkf.network.graphs import Topology
 from netkf.runs.outcomes import downtimes
 from netkf.scenario.scenario import Scenario
 from netkf.studies.explanation import GOOD_ENOUGH, InformationSource, Missing, WhatIf, Why
@@ -23,7 +21,6 @@ from netkf.studies.information import (
     USED,
     Flow,
     KeptReadings,
-    Messages,
     Newest,
     Reach,
     at_once,
@@ -36,11 +33,8 @@ from netkf.studies.information import (
 )
 from netkf.studies.message_sets import Candidate, SmallestSet, find_smallest_set
 from netkf.studies.opening import open as open_directory
-from netkf.studies.replay import Replayer
+from netkf.studies.replay import Outcome, Replayer
 from netkf.trace.run import Run
-
-if TYPE_CHECKING:
-    pass
 
 MAX_MISSING = 3  # largest size of a set of missing messages that is searched
 MIN_REPLAYS, MAX_REPLAYS, MAX_EVENTS = 10, 1000, 5_000_000
@@ -75,29 +69,13 @@ def why(
     Raises ScenarioError for a node, time or run that does not exist, and for a run without events.
     """
     run, run_scenario = _check_run(run, scenario, replica, trust)
-    found = run_scenario.topology.find(str(node))
-    if found is None:
-        listed = ", ".join(map(str, run_scenario.nodes[:8]))
-        listed += ", ..." if len(run_scenario.nodes) > 8 else ""
-        raise ScenarioError("node", "must be a node of the scenario", node, f"nodes: {listed}")
-    node = found
+    node = _find_node(run_scenario, node)
     at = _check_instant(run, run_scenario, at)
     # Keyword names are those of the command line: --most, --below, --replays.
     most = integer(low=1, high=MAX_MISSING)("most", most)
     limit = None if below is None else number(above=0.0)("below", below)
     replayer = Replayer(run_scenario, run.seed, run.replica, node, at)
-    logged, replayed = rows_until(run_scenario, run.log, at), replayer.log
-    if len(logged) != len(replayed) or not all(
-        np.array_equal(logged[name], replayed[name], equal_nan=logged[name].dtype.kind == "f")
-        for name in logged.dtype.names or ()
-    ):
-        rule = "has other events than its replay, so another scenario or version made it"
-        raise ScenarioError("run", rule, None, "run the scenario again")
-    outcome = replayer.outcome(error=True)
-    if not np.isfinite(outcome.xhat).all() or np.isinf(outcome.P).any():
-        raise ScenarioError(
-            "at", "lies after the run had diverged", at, "ask about an earlier time"
-        )
+    outcome = _check_replay(run, replayer)
     evidence = _Evidence(replayer, node, most)
     sources = evidence.sources()
     smallest = None
@@ -157,6 +135,31 @@ def _check_run(
     return run, run_scenario
 
 
+def _find_node(scenario: Scenario, node: int | str) -> int:
+    found = scenario.topology.find(str(node))
+    if found is None:
+        listed = ", ".join(map(str, scenario.nodes[:8]))
+        listed += ", ..." if len(scenario.nodes) > 8 else ""
+        raise ScenarioError("node", "must be a node of the scenario", node, f"nodes: {listed}")
+    return found
+
+
+def _check_replay(run: Run, replayer: Replayer) -> Outcome:
+    """Return the state of the node in the replay; raises ScenarioError unless it is that run."""
+    logged, replayed = rows_until(replayer.scenario, run.log, replayer.at), replayer.log
+    if len(logged) != len(replayed) or not all(
+        np.array_equal(logged[name], replayed[name], equal_nan=logged[name].dtype.kind == "f")
+        for name in logged.dtype.names or ()
+    ):
+        rule = "has other events than its replay, so another scenario or version made it"
+        raise ScenarioError("run", rule, None, "run the scenario again")
+    outcome = replayer.outcome(error=True)
+    if not np.isfinite(outcome.xhat).all() or np.isinf(outcome.P).any():
+        rule, remedy = "lies after the run had diverged", "ask about an earlier time"
+        raise ScenarioError("at", rule, replayer.at, remedy)
+    return outcome
+
+
 def _default_replays(events: int) -> int:
     """Return the default number of replays: fewer for long logs, to bound the time they take."""
     return min(MAX_REPLAYS, max(MIN_REPLAYS, MAX_EVENTS // max(1, events)))
@@ -182,10 +185,7 @@ class _Evidence:
         self.scenario = replayer.scenario
         talks, links = self.scenario.node_filter.timing.talks, self.scenario.topology.directions
         self._links = frozenset(links if talks else ())
-        swaps, slotted = (
-            self.scenario.node_filter.analysis.swaps,
-            self.scenario.slotted,
-        )
+        swaps, slotted = self.scenario.node_filter.analysis.swaps, self.scenario.slotted
         self.messages = match_messages(replayer.log, swaps, slotted)
         full = match_messages(replayer.full_log, swaps, slotted)
         # What some filters send depends on the messages that they have received.
@@ -258,9 +258,7 @@ class _Evidence:
             assert newest is not None
             unused = self._reach.messages_from(newest.segment, budget)
             missing = tuple(
-                _describe_missing(self.messages, m, self.scenario.topology)
-                for m in unused
-                if self._flow.cost[m]
+                self.missing[self.messages.key(m)] for m in unused if self._flow.cost[m]
             )
         return InformationSource(
             node=node,
@@ -290,18 +288,6 @@ class _Evidence:
             return None, len(unused)
         last = int(used[np.argmax(messages.used_row[used])])
         return last, int((messages.sent[unused] > messages.sent[last]).sum())
-
-
-def _describe_missing(messages: Messages, m: int, topology: Topology) -> Missing:
-    sender, receiver, number = messages.key(m)
-    return Missing(
-        topology.named(sender),
-        topology.named(receiver),
-        number,
-        OUTCOMES[int(messages.outcome[m])],
-        float(messages.sent[m]),
-        float(messages.arrived[m]),
-    )
 
 
 def _make_what_ifs(
