@@ -154,9 +154,7 @@ def find_checks(scenario: Scenario) -> PaperChecks:
 
 
 def _whole(scenario: Scenario, run: Run) -> tuple[Scenario, Run]:
-    """Return a scenario and its run as tests take them: of nodes that estimate all of the state if
-    they estimate the same blocks, else with the error 0 and the variance 1 beyond those of a node.
-    """
+    """Return scenario and run as tests take them: as if all nodes estimated the whole state."""
     if have_one_view(scenario):
         return scenario_of_view(scenario), run_of_view(scenario, run)
     e, P = without_padding(run.error, run.P)
@@ -176,9 +174,8 @@ def with_check_times(scenario: Scenario) -> Scenario:
 def run_replica(
     scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto"
 ) -> ReplicaResult:
-    """Simulate and summarise one ``replica`` of the runs of ``seed`` of a scenario with samples at
-    the times of :func:`with_check_times`. A user's filter class is also run as its built-in base,
-    the twin, for the first TWIN_RUNS replicas and where it diverged.
+    """Simulate and summarise one ``replica``; a user's class also runs as its built-in base, the
+    twin, for the first TWIN_RUNS replicas and where it diverged.
     """
     chosen = choose_engine(engine, scenario, announce=False)
     run, promised = simulate(scenario, seed, replica, chosen), with_promised_filter(scenario)
@@ -262,10 +259,8 @@ NONE_DIVERGED = Promise(
 def judge_replicas(
     scenario: Scenario, results: Iterable[ReplicaResult], seed: int, confidence: float
 ) -> Verdict:
-    """Return the verdict on a scenario from the ``results`` of its replicas of ``seed``, in their
-    order: a row for each promise of its filter's paper, of its parts and of the record of its runs.
-    All intervals hold together with probability ``confidence``. Raises TheoryError if there are no
-    covariances to judge.
+    """Return the verdict from the ``results`` of replicas of ``seed``, in their order; all
+    intervals hold together at ``confidence``. Raises TheoryError without covariances.
     """
     checks, replicas = find_checks(scenario), list(results)
     audits = [result.audit for result in replicas]

@@ -74,9 +74,8 @@ SINGULAR = 1e-12
 
 
 def summarise_exactly(scenario: Scenario, run: Run) -> ReplicaSummary:
-    """Return the summary of a run: P, errors and NEES, and the exact law of the errors given its
-    events. That is nan for later replicas, for too many errors together, and without known
-    equations.
+    """Return P, errors, NEES and the exact law of the errors given the events; nan for later
+    replicas, too many errors together, or unknown equations.
     """
     at, sampled = checked_samples(scenario, run.times), sampled_indices(scenario)
     whole, known = run, nodes_with_law(scenario)
@@ -315,9 +314,8 @@ def _compare_with_exact(
 @error_test
 @gaussian_test
 def check_error_covariance(samples: RunSamples, level: float) -> Finding:
-    """Test that errors have their exact mean and covariance given the events of each replayed run:
-    e' Sigma^-1 e is chi-square at every node and time and for all nodes (``runs.whole``), with half
-    of the ``level``, and for all errors of all times (``runs.joint``).
+    """Test that errors have their exact law given the events: e' Sigma^-1 e is chi-square at every
+    point and for all nodes, with half of ``level``, and for all times (``runs.joint``).
     """
     runs, scenario = samples.runs, samples.scenario
     n, max_runs = scenario.width, max_replayed(scenario)
@@ -350,9 +348,8 @@ def _compare_pooled(joint: FloatArray, level: float) -> Interval:
 
 @error_test
 def check_bias(samples: RunSamples, level: float) -> Finding:
-    """Test that errors less their exact mean have no constant bias, by generalised least squares
-    from ``runs.bias`` (R, n, n + 1). Its length is in standard deviations of an error. The interval
-    misses with at most the probability ``level``.
+    """Test that errors less their mean have no constant bias, by generalised least squares from
+    ``runs.bias`` (R, n, n + 1).
     """
     # Only these runs have exact covariances.
     max_runs = max_replayed(samples.scenario)
@@ -404,9 +401,8 @@ def _length_interval(spread: FloatArray, z: FloatArray, level: float) -> Interva
 @error_test
 @gaussian_test
 def check_expected_nees(samples: RunSamples, level: float) -> Finding:
-    """Test that NEES has its expected value given the events of each run. Given them it is a sum of
-    squares of standard normal numbers weighted by the eigenvalues of P^-1 Sigma, scaled to n; so is
-    its sum over runs. The interval misses with at most the probability ``level``.
+    """Test that NEES, a sum of squares of normals weighted by the eigenvalues of P^-1 Sigma, scaled
+    to n, has its expected value given the events.
     """
     runs, n = samples.runs, samples.scenario.width
     max_runs = max_replayed(samples.scenario)
@@ -453,9 +449,8 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
 @error_test
 @gaussian_test
 def check_nees(samples: RunSamples, level: float) -> Finding:
-    """Test that errors are Gaussian with covariance P given the messages: the sum of NEES over R
-    runs is chi-square with R n degrees of freedom at every node and time, with at most the
-    probability ``level`` of a miss.
+    """Test that errors are Gaussian with covariance P: the sum of NEES over R runs is chi-square
+    with R n degrees of freedom at every node and time.
     """
     n, nees = samples.scenario.width, samples.runs.nees.reshape(samples.count, -1)
     if np.isnan(samples.runs.e).all():
@@ -503,9 +498,8 @@ def check_nees_bound(samples: RunSamples, level: float) -> Finding:
 
 
 def pooled_nees(nees: FloatArray, mean: FloatArray, square: FloatArray, level: float) -> Interval:
-    """Return an interval for the relative difference between the sum of all NEES (R, K) and that of
-    their exact means (R, K); ``square`` (R, K) is half of the variances. Runs are independent;
-    points of a run add at most their deviations. It misses with at most the probability ``level``.
+    """Return an interval for the relative difference of the sums of NEES (R, K) and of their exact
+    means; ``square`` is half of the variances. Points of a run add at most their deviations.
     """
     spread = np.sqrt(2.0 * square).sum(axis=1)
     expected = float(mean.sum())

@@ -62,10 +62,7 @@ class HybridSamples(RunSamples):
 
     @cached_property
     def bound(self) -> FloatArray:
-        """The upper bound (K, N, n, n) on the mean of P over the ticks of the links, at the K
-        checked times and the sampled nodes: the coupled Riccati equations of the hybrid paper,
-        H (12).
-        """
+        """The bound (K, N, n, n) on the mean of P at K times and N nodes, H (12)."""
         times = np.array(check_times(self.scenario))
         all_nodes = covariance_bound(with_promised_filter(self.scenario), times)
         return all_nodes[:, sampled_indices(self.scenario)]

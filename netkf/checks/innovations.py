@@ -111,8 +111,8 @@ class ExpectedIncrements:
     def innovation(
         self, xhat: FloatArray, P: FloatArray, y: FloatArray, gap: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return y - H E[z] (p,) of increments y (p,) over ``gap`` seconds and the Cholesky factor
-        of its covariance; ``xhat`` (n,) and ``P`` (n, n) are the estimate before them.
+        """Return y - H E[z] (p,) of increments over ``gap`` s and the Cholesky factor of its
+        covariance, after the estimate ``xhat`` (n,), ``P`` (n, n).
         """
         n, H = self._n, self._H
         # Transition of (x, z) over the gap, and a square root of its noise covariance.
@@ -218,9 +218,8 @@ class Recorder(Filter):
 
 
 def compute_innovations(run: Run, max_events: int = MAX_EVENTS) -> Innovations:
-    """Return the innovations of a run, which is replayed for them. Raises NetkfError without
-    readings or covariances, for more than ``max_events`` events, and if the replay has other
-    events.
+    """Return the innovations of a run by a replay. Raises NetkfError without readings or
+    covariances, above ``max_events``, and for a replay with other events.
     """
     scenario: Scenario = run.scenario
     if len(run.log) > max_events:
@@ -272,9 +271,7 @@ def with_filter(scenario: Scenario, filtering: Any) -> Scenario:
 
 
 def innovation_series(recorded: Innovations) -> dict[int, FloatArray]:
-    """Return, by node with at least MIN_READINGS readings, the first components (M,) of the
-    whitened innovations of its M readings: white noise if P is exact.
-    """
+    """Return first components (M,) of whitened innovations by node with MIN_READINGS or more."""
     first_components = np.array([values[0] for values in recorded.whitened])
     series = {}
     for node in np.unique(recorded.nodes).tolist():

@@ -94,9 +94,8 @@ POOLED_TOLERANCE = 0.1
 def pool(
     single: Finding, pooled: Interval, what: str, tolerance: float = POOLED_TOLERANCE
 ) -> Finding:
-    """Return the finding of comparisons one by one, ``single``, and of all values together,
-    ``pooled``, which are ``what``. The caller gives each a part of the level. The pooled one, with
-    its own ``tolerance``, is far narrower and decides unless only a single one is significant.
+    """Return the finding of comparisons one by one, ``single``, and of all together, ``pooled``,
+    which is far narrower and decides unless only a single one is significant.
     """
     # The upper end of a margin below 0: the single comparison breaks the promise. A pooled value of
     # nan (nothing could be pooled) leaves the single comparisons too.
@@ -159,9 +158,8 @@ def diagonal_distances(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def growth_intervals(earlier: FloatArray, later: FloatArray, level: float) -> list[Interval]:
-    """Return an interval for the growth between samples ``earlier`` (S, n, n) and ``later`` (S', n,
-    n) of each diagonal entry: the largest P(later > GROWTH x) - P(earlier > x). Each misses with at
-    most the probability ``level``.
+    """Return intervals for the growth of each diagonal entry between two samples (S, n, n): the
+    largest P(later > GROWTH x) - P(earlier > x).
     """
     return [
         law_excess(GROWTH * earlier[:, k, k], later[:, k, k], level)
@@ -172,10 +170,8 @@ def growth_intervals(earlier: FloatArray, later: FloatArray, level: float) -> li
 def compare_growth(
     pairs: Sequence[Pair], expected: Sequence[tuple[FloatArray, FloatArray] | None], level: float
 ) -> Finding:
-    """Test that covariances stay stochastically bounded: the sample at the end of each pair,
-    ``second``, is at most GROWTH times that at half of the horizon. ``expected`` has samples of the
-    laws that both should have: only faster growth breaks the promise; without them growth leaves it
-    undecided. All err with at most the probability ``level``.
+    """Test that covariances stay stochastically bounded: ``second`` of a pair is at most GROWTH
+    times ``first``, at half of the horizon. Only growth faster than that ``expected`` breaks it.
     """
     single_level, early = 0.5 * level / sum(pair.first.shape[-1] for pair in pairs), False
     intervals = []

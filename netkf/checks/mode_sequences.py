@@ -51,8 +51,8 @@ class ModeTable(NamedTuple):
     def covariances(
         self, roots: FloatArray, sequences: np.ndarray, lengths: list[int]
     ) -> FloatArray:
-        """Return the covariances (L, K, n, n) of K filters after each of L increasing numbers of
-        slots, ``lengths``, from ``roots`` (K, n, n), by the modes ``sequences`` (K, T).
+        """Return covariances (L, K, n, n) of K filters after each of ``lengths`` slots, from
+        ``roots`` by the modes ``sequences`` (K, T).
         """
         results, applied = [], 0
         for length in lengths:
@@ -107,10 +107,8 @@ class SwitchedSamples(RunSamples):
         raise NotImplementedError
 
     def with_horizon(self, finding: Finding, distance: Callable[[Any], float]) -> Finding:
-        """Return a finding, if it says that the limit of a law is not reached, with the horizon in
-        seconds at which it would be; nan if that cannot be computed in a few seconds.
-
-        ``distance`` of a reference tells how far its law is from its limit.
+        """Return a finding whose limit is not reached with the horizon (s) at which it would be;
+        ``distance`` tells how far the law of a reference is from its limit.
         """
         if not finding.early:
             return finding

@@ -49,9 +49,8 @@ def errors_at_once(scenario: Scenario) -> int:
 
 
 def probe_times(scenario: Scenario) -> list[float]:
-    """Return the times in seconds at which runs are sampled: those of :func:`check_times`, and
-    further ones, evenly spread, for tests that pool the errors of all times: the fewer, the more
-    errors one time has (POOLED_ERRORS, MAX_POOLED).
+    """Return the times (s) at which runs are sampled: :func:`check_times`, and further ones for
+    tests that pool errors of all times (POOLED_ERRORS, MAX_POOLED).
     """
     checked = check_times(scenario)
     count = min(MAX_POOLED, POOLED_ERRORS // errors_at_once(scenario))
@@ -73,9 +72,7 @@ def checked_samples(scenario: Scenario, times: FloatArray) -> IntArray:
 
 
 def sampled_indices(scenario: Scenario) -> IntArray:
-    """Return the indices (W,) of the nodes whose samples are kept: all whose errors have a known
-    law, or evenly spaced ones.
-    """
+    """Return the nodes (W,) whose samples are kept: all with a known law, or spaced ones."""
     chosen, n = np.flatnonzero(nodes_with_law(scenario)), scenario.width
     if len(chosen) <= MAX_NODES:
         return chosen

@@ -89,11 +89,9 @@ class PushSumSamples(RunSamples):
 
     @cached_property
     def ratios(self) -> tuple[FloatArray, FloatArray]:
-        """Mean squares |W e|^2 / n (R', N) of the errors e at the end in units of the steady
-        covariance (W is ``steady_root``), and the eigenvalues (R', N, n) of W Sigma W', their
-        covariance given which links were up.
-
-        Each |W e|^2 is a sum of squares of n standard normal numbers with these weights.
+        """Mean squares |W e|^2 / n (R', N) at the end (W is ``steady_root``), sums of squares of
+        normals with as weights the eigenvalues (R', N, n) of W Sigma W' given the links that were
+        up.
         """
         W, Sigma = self.steady_root, self.runs.Sigma[self.followed, -1]
         e = np.einsum("iab,rib->ria", W, self.runs.e[self.followed, -1])

@@ -18,9 +18,8 @@ WIDTH = 87  # with the indent 100 columns
 
 
 def verdict_text(verdict: Verdict, claim: str = "", command: str = "", full: bool = True) -> str:
-    """Return the text of ``netkf check``: broken rows first and once more in short at the end, with
-    the ``command`` that replays their run. Unless ``full``, other rows have one line below their
-    promise.
+    """Return the text of ``netkf check``: broken rows first, and short at the end with ``command``;
+    unless ``full``, other rows have one line below their promise.
     """
     lines = [f"{verdict.scenario}: {claim}" if claim else verdict.scenario, ""]
     broken = [row for row in verdict.rows if row.verdict == BROKEN]

@@ -43,9 +43,8 @@ def compare_identities(
 
 
 def largest_terms(P: FloatArray, start: FloatArray, information: float = 0.0) -> FloatArray:
-    """Return the size (R, K, N) of the largest terms from which covariances P (R, K, N, n, n) were
-    computed: the largest trace so far at any node, ``start`` (N, n, n) included, and P^2 times the
-    ``information`` H' R^-1 H of an instant.
+    """Return the sizes (R, K, N) of the largest terms of which P was computed: traces so far,
+    ``start``, and P^2 times the ``information`` H' R^-1 H.
     """
     traces = np.nan_to_num(np.trace(P, axis1=-2, axis2=-1), nan=0.0, posinf=0.0)
     first = float(np.trace(start, axis1=-2, axis2=-1).max())

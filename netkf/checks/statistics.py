@@ -47,10 +47,9 @@ def round_digits(values: FloatArray) -> FloatArray:
 def law_distance(
     first: FloatArray, second: FloatArray, level: float, rounding: float = 0.0
 ) -> Interval:
-    """Return an interval for sup |F - G| of the laws of two samples (S,) and (S',), which may
-    depend on each other: Kolmogorov-Smirnov with a band around each. Values that differ by less
-    than ``rounding`` are equal. Further runs add to the first. It misses with at most the
-    probability ``level``.
+    """Return an interval for sup |F - G| of the laws of two samples (Kolmogorov-Smirnov), which may
+    depend on each other; values less than ``rounding`` apart are equal, further runs add to the
+    first.
     """
     gaps = np.abs(_ecdf_gaps(first, second, rounding))
     return _band_interval(gaps, len(first), len(second), level, grow=False)
@@ -59,9 +58,8 @@ def law_distance(
 def law_excess(
     first: FloatArray, second: FloatArray, level: float, rounding: float = 0.0
 ) -> Interval:
-    """Return an interval for the largest ``P(second > x) - P(first > x)`` over x of two samples
-    (S,) and (S',), to both of which further runs add; it misses with at most the probability
-    ``level``.
+    """Return an interval for the largest ``P(second > x) - P(first > x)`` of samples (S,) and
+    (S',), to both of which further runs add.
     """
     gaps = _ecdf_gaps(first, second, rounding)
     return _band_interval(gaps, len(first), len(second), level, grow=True)
@@ -127,9 +125,8 @@ def band_around(value: float, width: float, detectable: float = math.nan) -> Int
 
 
 def quadratic_interval(total: float, weights: FloatArray, level: float) -> Interval:
-    """Return the interval for c if ``total`` is c times sum_k weights_k z_k^2 with standard normal
-    z_k and ``weights`` (K,) >= 0: quantiles by Lugannani and Rice (1980), to a few per cent in the
-    tails, exact for equal weights. It misses with at most the probability ``level``.
+    """Return the interval of c if ``total`` is c times sum_k weights_k z_k^2 with standard normal
+    z_k: Lugannani and Rice (1980), to a few per cent in the tails, exact for equal weights.
     """
     weights = weights[weights > 1e-12 * weights.max(initial=0.0)]
     if not len(weights):
@@ -187,9 +184,8 @@ def _log_tail(weights: FloatArray, s: float) -> float:
 
 
 def eigenvalue_interval(samples: FloatArray, level: float) -> Interval:
-    """Return an interval for the largest eigenvalue of the mean of R symmetric ``samples`` (R, n,
-    n): Scheffe's method with Hotelling's T^2 for their n (n + 1) / 2 entries, which must have a
-    variance. It misses with at most the probability ``level``.
+    """Return an interval for the largest eigenvalue of the mean of symmetric ``samples`` (R, n, n):
+    Scheffe's method with Hotelling's T^2.
     """
     count, n = len(samples), samples.shape[-1]
     mean = samples.mean(axis=0)

@@ -22,9 +22,8 @@ RATE_TOLERANCE = 0.05  # of the share of slots with a message
 
 
 def check_rate(samples: RunSamples, level: float) -> Finding:
-    """Test that nodes send with their stated probability given the past: messages less the sum of
-    the probabilities are a martingale. Student's interval over the runs misses with at most the
-    probability ``level``.
+    """Test that nodes send with their probability given the past: messages less the sum of the
+    probabilities are a martingale (Student's interval over the runs).
     """
     sent, expected = samples.runs.sends.T
     total = float(expected.mean())

@@ -40,9 +40,7 @@ class DelayCounts(NamedTuple):
 
 
 def count_fixed(ages: FloatArray, fixed: float, size: int) -> DelayCounts:
-    """Return the distance of the delays ``ages`` (K,) in seconds from a ``fixed`` one, as counts of
-    ``size`` directions.
-    """
+    """Return the distance of ``ages`` (K,) in seconds from a ``fixed`` delay, as counts."""
     largest_error = np.abs(ages - fixed).max(initial=0.0)
     return DelayCounts(
         np.zeros((CELLS, 2)), np.zeros(3), np.zeros((2, size)), np.array(largest_error)
@@ -57,9 +55,8 @@ def count_delays(
     size: int,
     horizon: float,
 ) -> DelayCounts:
-    """Return the counts of K messages in order of their direction, one of ``size``, and number,
-    which are ``sent`` (K,) and take ``ages`` (K,) seconds, inf if they are under way at the end of
-    the run, the ``horizon``.
+    """Return the counts of K messages, in order of direction and number, ``sent`` (K,) and taking
+    ``ages`` (K,) seconds, inf where under way at the ``horizon``.
     """
     ranks = censored_ranks(law, sent, ages, horizon)
     # The first message of each direction has no neighbour before it.

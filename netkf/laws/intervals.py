@@ -48,9 +48,7 @@ class Interval(NamedTuple):
         return value - (self.value - self.low) / root, value + (self.high - self.value) / root
 
     def expected_high(self, factor: float) -> float:
-        """Return the upper limit expected with ``factor`` times the samples, if the distance found
-        is sampling error.
-        """
+        """Return the upper limit expected with ``factor`` times the samples if the truth is 0."""
         # Sampling error shrinks as 1 / sqrt(samples); a value of 0 or below is kept.
         value = self.value / math.sqrt(factor) if self.value > 0.0 else self.value
         return self.limits(value, factor)[1]
@@ -81,18 +79,13 @@ NO_COMPARISON = Comparison([], "too few values in these runs")
 
 
 def detectable_shift(deviation: float, level: float) -> float:
-    """Return the shift that a two-sided test at ``level`` detects with probability POWER, for a
-    normal estimate with standard deviation ``deviation``.
-    """
+    """Return the shift of a normal estimate that a two-sided test detects with POWER."""
     return deviation * float(scipy.special.ndtri(1.0 - level / 2.0) + scipy.special.ndtri(POWER))
 
 
 def detectable_shift_of_student(count: float, level: float) -> float:
-    """Return the shift, in true standard deviations of an estimate, that Student's test at
-    ``level`` with ``count`` - 1 degrees of freedom detects with probability POWER.
-
-    It is the noncentrality at which the quantile 1 - POWER of the noncentral t law is Student's
-    critical value; the other tail has a negligible part of the power.
+    """Return the shift, in deviations of an estimate, that Student's test of ``count`` values
+    detects with POWER: the noncentrality at which the quantile 1 - POWER is the critical value.
     """
     freedom = max(count - 1.0, 1.0)
     critical = -float(scipy.special.stdtrit(freedom, level / 2.0))
@@ -101,9 +94,7 @@ def detectable_shift_of_student(count: float, level: float) -> float:
 
 @lru_cache(maxsize=1024)
 def noncentrality(freedom: float, critical: float) -> float:
-    """Return the noncentrality at which a t variable with ``freedom`` degrees of freedom exceeds
-    ``critical`` with probability POWER.
-    """
+    """Return the noncentrality at which a t variable exceeds ``critical`` with POWER."""
     # (z + shift) / sqrt(u / freedom) > critical, z normal and u chi-square: by quadrature over the
     # quantiles of u, since scipy's noncentral t fails for the small levels used here.
     u = scipy.special.gammaincinv(0.5 * freedom, _MIDDLES) * 2.0 / freedom
@@ -117,11 +108,7 @@ def noncentrality(freedom: float, critical: float) -> float:
 
 
 def student_interval(value: float, deviation: float, count: float, level: float) -> Interval:
-    """Return Student's t interval for an estimate ``value``, whose standard ``deviation`` was
-    estimated from ``count`` independent values (or an effective number of them).
-
-    The interval misses the truth with at most the probability ``level``.
-    """
+    """Return Student's interval of ``value``, with a ``deviation`` of ``count`` values."""
 
     def limits(value: float, factor: float) -> tuple[float, float]:
         quantile = -float(scipy.special.stdtrit(factor * count - 1.0, level / 2.0))
@@ -156,9 +143,7 @@ def interval_of_squares(values: FloatArray, level: float) -> tuple[float, float]
 
 
 def probability_interval(successes: int, trials: int, level: float) -> Interval:
-    """Return the exact interval of Clopper and Pearson (1934) for the probability of a success,
-    from ``successes`` in independent ``trials``; it misses with probability ``level``.
-    """
+    """Return the interval of Clopper and Pearson (1934) for a probability of success."""
     low = high = detectable = math.nan
 
     def limits(share: float, factor: float) -> tuple[float, float]:
@@ -196,8 +181,7 @@ def _binomial_rise(p: float, trials: int, level: float) -> float:
 
 
 def with_drawn(interval: Interval, sample_factor: Callable[[float], float]) -> Interval:
-    """Return ``interval`` with another forecast of its limits with more runs, for an estimate whose
-    samples do not grow in proportion to the runs: ``factor`` times the runs mean
+    """Return ``interval`` whose forecast for ``factor`` times the runs is that of
     ``sample_factor(factor)`` times the samples.
     """
 
@@ -210,9 +194,7 @@ def with_drawn(interval: Interval, sample_factor: Callable[[float], float]) -> I
 
 
 def deviation_interval(expected: float, interval: Interval) -> Interval:
-    """Return an interval for the distance |quantity - expected| from the ``interval`` of a
-    quantity that should be ``expected``; it excludes 0 if and only if the given one excludes that.
-    """
+    """Return the interval of |quantity - expected| from the ``interval`` of the quantity."""
     covers = interval.low <= expected <= interval.high
     ends = abs(interval.low - expected), abs(interval.high - expected)
     low = 0.0 if covers else min(ends)
@@ -236,11 +218,7 @@ def deviation_interval(expected: float, interval: Interval) -> Interval:
 
 
 def scale_interval(total: float, freedom: float, level: float) -> Interval:
-    """Return the interval for c if ``total`` is c times a chi-square variable with ``freedom``
-    degrees of freedom; its estimate is total / freedom.
-
-    The interval misses the truth with at most the probability ``level``.
-    """
+    """Return the interval of c if ``total`` is c times a chi-square variable."""
 
     def quantiles(freedom: float) -> tuple[float, float]:
         tails = 1.0 - level / 2.0, level / 2.0
@@ -261,10 +239,8 @@ def scale_interval(total: float, freedom: float, level: float) -> Interval:
 
 
 def correlation_interval(value: float, count: float, level: float) -> Interval:
-    """Return an interval for the correlation of two normal variables by Fisher's transformation:
-    atanh of the estimate ``value`` from ``count`` pairs has the variance 1 / (count - 3).
-
-    The interval misses the truth with at most the probability ``level``.
+    """Return the interval of a correlation ``value`` of ``count`` normal pairs by Fisher's
+    transformation: atanh of it has the variance 1 / (count - 3).
     """
     spread = 1.0 / math.sqrt(max(count - 3.0, 1.0))
     reach = -spread * float(scipy.special.ndtri(level / 2.0))
@@ -279,11 +255,7 @@ def correlation_interval(value: float, count: float, level: float) -> Interval:
 
 
 def poisson_interval(total: float, mean: float, level: float) -> Interval:
-    """Return the exact (Garwood 1936) interval for the mean of a Poisson variable, in units of
-    ``mean``, from one observation ``total``.
-
-    The interval misses the truth with at most the probability ``level``.
-    """
+    """Return Garwood's interval (1936) of a Poisson mean in units of ``mean``."""
 
     def limits(ratio: float, factor: float) -> tuple[float, float]:
         count, expected = ratio * mean * factor, mean * factor

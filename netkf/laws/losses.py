@@ -55,9 +55,7 @@ class LossLaw(NamedTuple):
 
     @property
     def variance_factor(self) -> float:
-        """Factor, at least 1, by which bursts and shared draws raise the variance of the number of
-        losses over that of independent messages, in long runs.
-        """
+        """Factor by which bursts and shared draws raise the variance of the number of losses."""
         factor, chain = (2.0 if self.shared else 1.0), self.chain
         q = float(self.lost[0]) if len(self.lost) else 0.0
         spread = q * (1.0 - q)
@@ -104,9 +102,7 @@ class PairCounts(NamedTuple):
 
 
 def count_outcomes(lost: np.ndarray, opposite: np.ndarray) -> LossCounts:
-    """Return the counts of R runs in which K messages are sent over each of D directions at once,
-    from the mask ``lost`` (R, K, D) and the index (D,) of the ``opposite`` directions.
-    """
+    """Return the counts of R runs of K messages in D directions from ``lost`` (R, K, D)."""
     parts = np.array_split(lost, WINDOWS, axis=1)
     sent = [np.full((len(lost), lost.shape[2]), part.shape[1]) for part in parts]
     return LossCounts(
@@ -178,14 +174,12 @@ def _loss_interval(
 def share_of_bounded_runs(
     excess: FloatArray, sent: np.ndarray, expected: float, level: float
 ) -> Interval:
-    """Return an interval for the lost share of messages that holds whatever the law of the losses
-    within a run, for losses too rare for a sample variance; only runs are independent.
+    """Return an interval for the lost share of messages whatever the law of losses within a run,
+    for losses too rare for a sample variance.
 
-    ``excess`` (R,) is the number of messages lost in each run less the expected number, ``sent``
-    (R,) the number of messages, ``expected`` the stated share. By Hoeffding's bound
-    (1963, Theorem 1) the average of R independent numbers in [0, 1] with mean m is f, or further
-    from m, with a probability of at most exp(-R KL(f, m)), KL the Kullback-Leibler divergence of
-    Bernoulli laws. The interval misses the truth with at most the probability ``level``.
+    ``excess`` (R,) are messages lost less those expected, ``sent`` (R,) messages, ``expected`` the
+    stated share. By Hoeffding (1963, Theorem 1) the average of R independent numbers in [0, 1] with
+    mean m is f, or further from m, with a probability of at most exp(-R KL(f, m)).
     """
     runs, max_sent = len(sent), float(sent.max())
     # The numbers are lost messages over ``max_sent``; their mean is the share over ``scale``.
@@ -218,9 +212,7 @@ def _share_at(centre: float, end: float, limit: float) -> float:
 
 
 def compare_bursts(law: LossLaw, counts: LossCounts, level: float) -> Comparison:
-    """Compare the probability that the message after a lost one is lost too, of R runs, with that
-    of the stated chain.
-    """
+    """Compare the probability of a loss after a loss with that of the stated chain."""
     assert law.chain is not None
     runs, followed = len(counts.sent), counts.followed.sum(axis=1)
     total = float(followed.sum())

@@ -52,9 +52,7 @@ class NoiseDraws(NamedTuple):
 
 
 def noise_draws(z: FloatArray, states: FloatArray) -> NoiseDraws:
-    """Return the draws of one run from its noises ``z`` (S, d) and the ``states`` (S, n, d), or
-    (S, n, 1), to which each is added, 0 where one is not known.
-    """
+    """Return the draws of a run from noises ``z`` (S, d) added to ``states``, 0 if unknown."""
     known = (states != 0.0) & np.isfinite(z)[:, None]
     products = np.where(known, states, 0.0) * np.nan_to_num(z)[:, None]
     return NoiseDraws(z, np.array([known.sum(axis=0), products.sum(axis=0)]))
@@ -72,9 +70,7 @@ class Whitening(NamedTuple):
 
 
 def whiten(S: FloatArray, share: float = 1e-12) -> Whitening:
-    """Return the whitening factors of a covariance ``S`` (n, n), whose directions with less than
-    that ``share`` of the largest variance count as without noise.
-    """
+    """Return whitening factors of ``S`` without directions below a ``share`` of the largest."""
     values, vectors = np.linalg.eigh(symmetric(S))
     positive = values > share * max(float(values[-1]), np.finfo(float).tiny)
     factor = (vectors[:, positive] / np.sqrt(values[positive])).T
@@ -82,9 +78,7 @@ def whiten(S: FloatArray, share: float = 1e-12) -> Whitening:
 
 
 def transition_law(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
-    """Return the transition matrix ``e^{A g}`` (n, n) of dx = A x dt + B dw over g = ``gap``
-    seconds, and the covariance (n, n) of its noise (Van Loan, 1978), for A (n, n) and B (n, m).
-    """
+    """Return e^{A g} and the covariance of the noise (Van Loan, 1978) over ``gap`` seconds."""
     n = len(A)
     E = scipy.linalg.expm(np.block([[-A, B @ B.T], [np.zeros((n, n)), A.T]]) * gap)
     W = E[n:, n:].T @ E[:n, n:]
@@ -92,11 +86,8 @@ def transition_law(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray
 
 
 def moment_law(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
-    """Return the law of the state after ``gap`` seconds together with the two moments of x over
-    them: its response (3 n, n) to the state before, and the covariance (3 n, 3 n) of its noise.
-
-    The plant is dx = A x dt + B dw with A (n, n) and B (n, m). The moments are the integrals of x
-    and of x times the Legendre polynomial P_1 over the gap.
+    """Return response (3 n, n) and noise covariance (3 n, 3 n) of the state of dx = A x dt + B dw
+    after ``gap`` seconds and of its moments, the integrals of x and of x times the Legendre P_1.
     """
     n, zero, eye = len(A), np.zeros_like(A), np.eye(len(A))
     # x, I = int x ds and J = int I ds: int s x ds = g I - J.

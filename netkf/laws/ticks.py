@@ -101,12 +101,7 @@ class TickSeries(NamedTuple):
 def count_by_window(
     times: FloatArray, indices: np.ndarray, size: int, horizon: float
 ) -> np.ndarray:
-    """Return how often each of ``size`` indices occurs in each of W equal parts of [0, ``horizon``]
-    (seconds), (W, size), from the ``times`` (K,) and ``indices`` (K,) of K events.
-
-    Counts of different windows are independent, as those of different runs are, so that
-    correlations between clocks can be detected in fewer runs.
-    """
+    """Return how often each of ``size`` indices occurs in W equal parts of a run, (W, size)."""
     windows = WINDOWS if size <= MAX_WINDOWED else 1
     flat_index = np.minimum((times * (windows / horizon)).astype(np.int64), windows - 1)
     counts = np.bincount(flat_index * size + indices, minlength=windows * size)
@@ -116,10 +111,7 @@ def count_by_window(
 def count_ticks(
     group: ClockGroup, times: FloatArray, owners: np.ndarray, horizon: float
 ) -> TickCounts:
-    """Return the counts by which the clocks of ``group`` are compared with their laws, from the
-    ``times`` (K,) in seconds of the K ticks of a run of ``horizon`` seconds, and the indices
-    ``owners`` (K,) of their clocks in the group.
-    """
+    """Return the counts of the ticks at ``times`` (K,) of the clocks ``owners`` (K,) of a group."""
     size = len(group.entities)
     windows = count_by_window(times, owners, size, horizon)
     # After its last tick each clock has a gap that the run does not finish.
@@ -225,9 +217,7 @@ def rates_of_all(
 def rates_of_each(
     group: ClockGroup, counts: np.ndarray, slack: FloatArray, horizon: float, level: float
 ) -> list[Interval]:
-    """Return intervals, at ``level`` together, for the relative errors of the rates of E clocks,
-    from their ``counts`` (R, E) in R runs of ``horizon`` seconds.
-    """
+    """Return intervals, together at ``level``, of relative errors of rates of E clocks."""
     expected, single = group.rates * horizon, level / len(group.rates)
     return [
         count_interval(counts[:, k], float(mean), single, group.poisson, float(slack[k]))
@@ -308,14 +298,13 @@ def compare_clocks(
 def largest_correlation(
     values: FloatArray, variances: FloatArray, level: float
 ) -> tuple[Interval, tuple[int, int]] | None:
-    """Return an interval for the largest |correlation| of two columns of ``values`` (K, L), such as
-    the counts of two clocks, and the indices of the two.
+    """Return an interval for the largest |correlation| of two columns of ``values`` (K, L), of mean
+    0 and ``variances`` (K, L) in independent rows, and the indices of the two.
 
-    Values have mean 0, the expected ``variances`` (K, L), and independent rows. The products of two
-    columns, in units of their expected deviations (those that were seen would be far too small
-    where events are rare), are averaged by Student's interval, with Bonferroni's correction for all
-    pairs. None with fewer than two columns of MIN_EVENTS expected events, or 100 rows. The interval
-    misses the truth with at most the probability ``level``.
+    Products of two columns in units of their expected deviations (those that were seen would be far
+    too small where events are rare) are averaged by Student's interval, with Bonferroni's
+    correction for all pairs. None with fewer than two columns of MIN_EVENTS expected events, or 100
+    rows.
     """
     frequent = np.flatnonzero(variances[:, :MAX_CLOCKS].sum(axis=0) >= MIN_EVENTS)
     if len(frequent) < 2 or len(values) < 100:

@@ -54,9 +54,8 @@ class Ranks(NamedTuple):
 def censored_ranks(
     law: WaitingLaw, begin: FloatArray, duration: FloatArray, horizon: FloatArray | float
 ) -> Ranks:
-    """Return the ranks of K waiting times under their ``law``, which ``begin`` (K,) and have the
-    ``duration`` (K,) in its unit of time, inf for those unfinished at the end of the run, the
-    ``horizon``, one number or (K,).
+    """Return the ranks of K waiting times, which ``begin`` (K,) and last a ``duration`` (K,), inf
+    for those unfinished at the ``horizon``, under their ``law``.
     """
     # A cut of at most half of the run leaves waiting times to look at.
     known = np.floor(CELLS * law.cdf(np.broadcast_to(0.5 * horizon, begin.shape)) + 1e-9)
@@ -70,9 +69,7 @@ def censored_ranks(
 
 
 def count_ranks(ranks: Ranks) -> FloatArray:
-    """Return for each of CELLS equal parts of [0, 1] how many ranks are in it, and how many could
-    be seen in it, (CELLS, 2).
-    """
+    """Return how many ranks are, and could be, in each of CELLS parts of [0, 1], (CELLS, 2)."""
     looked_at = np.isfinite(ranks.rank)
     rank, known = ranks.rank[looked_at], ranks.known[looked_at].astype(np.int64)
     cells = np.minimum((CELLS * rank).astype(np.int64), CELLS - 1)
@@ -108,9 +105,7 @@ def correlate_neighbours(ranks: Ranks, first: np.ndarray) -> FloatArray:
 
 
 def neighbour_correlation(products: FloatArray, level: float) -> Interval | None:
-    """Return an interval for the correlation of neighbours from the ``products`` (R, 3) of R runs
-    (:func:`correlate_neighbours`), which misses with probability ``level``; None for few pairs.
-    """
+    """Return the interval of the correlation of neighbours, None for few pairs."""
     total, squares, pairs = products.sum(axis=0)
     if pairs < MIN_SEEN:
         return None
@@ -118,10 +113,8 @@ def neighbour_correlation(products: FloatArray, level: float) -> Interval | None
 
 
 def compare_shares(cells: FloatArray, level: float, noun: str) -> Comparison:
-    """Compare waiting times (``noun``) with their stated law: how many are in each of CELLS
-    ``cells`` of equal probability, and how many could be, (CELLS, 2).
-
-    Cells which few runs can show are left out. All intervals hold at ``level``.
+    """Compare waiting times with their law: how many are in cells of equal probability, and could
+    be, (CELLS, 2), without cells that few runs can show.
     """
     visible = [k for k, trials in enumerate(cells[:, 1].tolist()) if trials >= MIN_SEEN]
     if not visible:
@@ -137,9 +130,7 @@ def compare_shares(cells: FloatArray, level: float, noun: str) -> Comparison:
 
 
 def cell_interval(count: float, total: float, level: float) -> Interval:
-    """Return the interval, at ``level``, of the distance between the share of the numbers in a
-    cell, ``count`` out of ``total``, and its probability.
-    """
+    """Return the interval of the distance between a cell's share and its probability."""
     return deviation_interval(1.0 / CELLS, probability_interval(int(count), int(total), level))
 
 

@@ -115,10 +115,7 @@ def _check_channel(part: Any, topology: Topology | None, seed: int) -> None:
 
 
 def table_entries(topology: Topology) -> dict[Link, float]:
-    """Return the entry of the graph's table of delivery probabilities for each directed link.
-
-    Graphs without a table get the entries of TABLE in turn.
-    """
+    """Return the entries of the graph's table by directed link, or those of TABLE in turn."""
     if topology.delivery is not None:
         return {link: topology.delivery.get(link, 1.0) for link in topology.directions}
     return {link: TABLE[k % len(TABLE)] for k, link in enumerate(topology.directions)}

@@ -20,9 +20,7 @@ class RecordingGenerator(np.random.Generator):
         self.calls: Calls = []
 
     def __getattribute__(self, name: str) -> Any:
-        """Return the attribute ``name``; methods that draw numbers are wrapped, so that each call
-        is appended to ``calls``.
-        """
+        """Return an attribute; calls of methods that draw are appended to ``calls``."""
         attribute = super().__getattribute__(name)
         if name.startswith("_") or name in ("calls", "take_calls", "bit_generator"):
             return attribute

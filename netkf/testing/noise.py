@@ -40,9 +40,7 @@ def family_level() -> float:
 
 
 def demand_agreement(comparison: Comparison, where: str, rule: str, remedy: str = "") -> None:
-    """Raise AssertionError with the line ``where: rule; got ...; remedy`` if draws differ
-    significantly from what is stated.
-    """
+    """Raise AssertionError ``where: rule; got ...; remedy`` if draws differ from their law."""
     if comparison.worst is not None:
         found, label = comparison.worst
         spread = 0.5 * (found.high - found.low)
@@ -64,12 +62,8 @@ class NoiseLabels(NamedTuple):
 
 
 def check_white(e: FloatArray, labels: NoiseLabels) -> None:
-    """Check that ``e`` (R, K, q), noise with q components of R runs at K times, is standard white
-    noise.
-
-    In every part of a run its mean must be 0 and its covariance 1; components at different times,
-    and runs, must be uncorrelated. Raises AssertionError for the most significant deviation of the
-    first family of tests that fails.
+    """Check that ``e`` (R, K, q), of R runs at K times, is standard white noise: mean 0 and
+    covariance 1 in every part of a run, and no correlation in time, or between components or runs.
     """
     if len(e) > 1:
         # First, because with equal runs (from a fixed seed) all other standard errors are wrong.
@@ -96,10 +90,7 @@ def _check_moments(e: FloatArray, labels: NoiseLabels, when: str) -> None:
 
 
 def check_uncorrelated(one: FloatArray, other: FloatArray, labels: NoiseLabels, apart: str) -> None:
-    """Check that unit noises ``one`` (..., q) and ``other`` (..., r), paired along all but the last
-    axis, are uncorrelated; ``labels`` and ``apart`` say in messages which noises they are and how
-    they are related.
-    """
+    """Check that unit noises (..., q) and (..., r), ``apart`` somehow, are uncorrelated."""
     if one[..., 0].size < MIN_VALUES:
         return
     rule = f"{labels.noise} must be uncorrelated with {labels.noise} {apart}"
@@ -110,10 +101,8 @@ def check_uncorrelated(one: FloatArray, other: FloatArray, labels: NoiseLabels, 
 def check_independent(
     e: FloatArray, covariates: FloatArray, labels: NoiseLabels, name: str
 ) -> None:
-    """Check that mean and variance of unit noise e (N, q) do not depend on ``covariates`` (N, r).
-
-    These are values before the noise is drawn, which messages call ``name``. Noise is compared
-    where a covariate is above its median and where it is below.
+    """Check that mean and variance of unit noise e (N, q) are the same above and below the medians
+    of ``covariates`` (N, r), values before the noise is drawn, which messages call ``name``.
     """
     rule = f"{labels.noise} must not depend on {name}"
     for comparison in compare_sides(e, covariates, family_level()) if len(e) >= MIN_VALUES else ():
@@ -123,10 +112,8 @@ def check_independent(
 def whitened(
     noise: FloatArray, S: FloatArray, size: float, where: str, rule: str, remedy: str = ""
 ) -> FloatArray:
-    """Return ``noise`` (..., q) of covariance ``S`` (q, q) as standard white noise (..., r).
-
-    Raises AssertionError with the line ``where: rule; got ...; remedy`` unless it is 0, relative to
-    the ``size`` of what it is added to, in directions in which S has no noise.
+    """Return ``noise`` (..., q) of covariance ``S`` as standard white noise (..., r). Raises
+    AssertionError unless it is 0, relative to ``size``, where S has no noise.
     """
     whitening = whiten(S)
     error = float(np.abs(noise @ whitening.null_space.T).max(initial=0.0)) / size

@@ -330,10 +330,8 @@ class Observed(Filter):
 def check_estimate(
     watched: WatchedPart, state: Any, n: int, after: str
 ) -> tuple[FloatArray, FloatArray | None]:
-    """Return ``estimate(state)``: xhat (n,), and P (n, n) or None.
-
-    Raises AssertionError unless both have these shapes and are finite, and P is symmetric and
-    positive semidefinite. ``after`` is the method that returned the state, for messages.
+    """Return xhat (n,) and P (n, n) or None of a state that the method ``after`` returned; raises
+    AssertionError unless they are finite and P is symmetric and positive semidefinite.
     """
     where = f"{watched.name}.estimate after {after}"
     pair = watched.call("estimate", state)

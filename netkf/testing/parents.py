@@ -35,10 +35,8 @@ class Difference(NamedTuple):
 
 
 def check_parent(watched: WatchedPart, same_as_parent: bool | None) -> None:
-    """Compare the estimates of a filter with those of the built-in class that it derives from.
-
-    Both run with the same settings, readings and messages, in slots and under the clocks that both
-    support. Nothing is compared if the class overrides nothing or ``same_as_parent`` is False.
+    """Compare a filter that overrides something with its built-in parent, in slots and under
+    clocks.
 
     Raises AssertionError if estimates differ by more than TOLERANCE; with ``same_as_parent`` None,
     a class that defines one of the methods STEPS gets a UserWarning instead.
@@ -88,9 +86,7 @@ def _forbid_transposed(name: str, child: WatchedPart, parent: WatchedPart) -> No
 
 
 def largest_difference(child: WatchedPart, parent: WatchedPart) -> Difference | None:
-    """Return the largest relative difference of the estimates of two filters at the end of any slot
-    or round; None if they cannot run in the same kind of time.
-    """
+    """Return the largest relative difference of two filters' estimates, or None."""
     found: list[Difference] = []
     # Where all nodes hear the same, weights of estimates show only if these differ at first.
     spread = 1.0 if isinstance(getattr(child.part, "weights", None), np.ndarray) else 0.0

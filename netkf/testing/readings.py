@@ -51,17 +51,13 @@ class SensorReader:
         return self.sensor.slot_path(node, PERIOD, generator)
 
     def read_several(self, path: Any, ks: Sequence[int], x: FloatArray) -> ReadingSeries:
-        """Return the readings y (K, p) and their H (K, p, n) with the increasing numbers ``ks``
-        (K,) at the states ``x`` (K, n), taken in one call.
-        """
+        """Return y (K, p) and H (K, p, n) of readings ``ks`` at ``x`` (K, n), in one call."""
         y, H = call_user_function(self.where, path.several, ks, x)
         y = demand_array(self.where, "y of several", y, (len(ks), self.p))
         return ReadingSeries(y, demand_array(self.where, "H of several", H, (*y.shape, self.n)))
 
     def read_one(self, path: Any, k: int, x: FloatArray) -> ReadingSeries:
-        """Return reading number ``k`` at the state ``x`` (n,), as a series of one reading: y
-        (1, p), H (1, p, n).
-        """
+        """Return reading number ``k`` at the state ``x`` (n,) as a series of one reading."""
         with guard_user_code(self.where):
             y, H = self._read_one(path, k, x)
         y = demand_array(self.where, "a reading", y, (self.p,))
@@ -90,9 +86,7 @@ def generators(streams: Streams, node: int) -> Callable[[str], np.random.Generat
 
 
 def make_readers(sensor: Sensor, name: str) -> list[SensorReader]:
-    """Return the reader of a sensor, in a list: of its samples if it has a sampling clock or its
-    class overrides ``samples``, else of its readings in slots. ``name`` is that of the class.
-    """
+    """Return the reader of samples, or else of readings in slots, in a list."""
     has_clock = getattr(sensor, "sampling", None) is not None
     overrides_samples = type(sensor).samples not in (Sensor.samples, LinearSensor.samples)
     if has_clock or (overrides_samples and not sensor.varying):
@@ -126,9 +120,7 @@ class IncrementReader(SensorReader):
     def read_pieces(
         self, streams: Streams, node: int, x: FloatArray, steps: int, cut: bool
     ) -> IncrementPieces:
-        """Return the increments that ``node`` (an id) reads over ``steps`` steps at the constant
-        state ``x`` (n,), each step ``cut`` into pieces at CUTS or not.
-        """
+        """Return increments over ``steps`` at a constant ``x`` (n,), each ``cut`` or not."""
         generator, A = generators(streams, node), np.zeros((self.n, self.n))
         plant = Diffusion(mean=x, A=A, B=A[:, :1], sensing_period=STEP)
         all_moments, spans, step = [], [], []
@@ -147,9 +139,7 @@ class IncrementReader(SensorReader):
         return IncrementPieces(np.array(all_moments), np.array(spans), np.array(step))
 
     def combine(self, pieces: IncrementPieces) -> FloatArray:
-        """Return the two moments (S, 2, p) of the increments over S whole steps, the integrals of
-        dy and of P_1 dy (P_1: Legendre polynomial), from those of the pieces of the steps.
-        """
+        """Return the moments (S, 2, p) of increments over whole steps."""
         total = np.zeros((int(pieces.step[-1]) + 1, 2, self.p))
         for moments, (start, end), k in zip(*pieces, strict=True):
             # On a piece, P_1 of the step is its value in the middle of the piece plus the share of
@@ -161,9 +151,7 @@ class IncrementReader(SensorReader):
 
 
 def demand_matrices(sensor: Any, name: str) -> None:
-    """Raise AssertionError unless H (p, n) and R (p, p) of a sensor are matrices of these shapes;
-    ``name`` is that of its class.
-    """
+    """Raise AssertionError unless H (p, n) and R (p, p) of a sensor have these shapes."""
     for field in ("H", "R"):
         matrix = getattr(sensor, field, None)
         is_matrix = isinstance(matrix, np.ndarray) and matrix.ndim == 2

@@ -57,10 +57,7 @@ class System(NamedTuple):
 
 
 def make_systems(inverts: bool) -> list[System]:
-    """Return four systems of n = 1, 2 and 3 states with p = 0, 1 and 2 rows of readings.
-
-    One has cov = 0, unless the filter ``inverts`` covariances.
-    """
+    """Return systems with n = 1 .. 3, p = 0 .. 2; one has cov = 0 unless the filter ``inverts``."""
     random, systems = Streams(0).generator("testing"), []
     for n, p, is_certain in ((1, 1, False), (2, 1, True), (3, 0, False), (3, 2, False)):
         noise_factor, cov_factor = random.normal(size=(2, n, n))
@@ -149,11 +146,8 @@ def setups(*parts: Any) -> Iterator[tuple[System, Kind]]:
 def run(
     watched: WatchedPart, system: System, kind: Kind, shifted: bool = False, spread: float = 0.0
 ) -> tuple[list[Seen], Run]:
-    """Run the filter of a user on a complete network of 2 or 3 nodes, of which node 1 has no
-    sensor, and return the estimates as they were made, and the run.
-
-    With ``shifted`` the truth, all states and messages under way are shifted on the way; ``spread``
-    is the difference between the first estimates of a node and of the one before.
+    """Run a filter on a complete network of 2 or 3 nodes, node 1 without a sensor; return estimates
+    and run. ``shifted`` shifts truth and states on the way, ``spread`` is between first estimates.
     """
     timing, n = watched.part.timing, len(system.M)
     tick = 1.0 if kind.slots else INCREMENT_TICK if kind.increments else SAMPLE_TICK

@@ -32,11 +32,7 @@ MERSENNE_BYTES = 4 * 625
 
 
 def fail(where: str, rule: str, got: object = None, remedy: str = "") -> NoReturn:
-    """Raise AssertionError with the line ``where: rule; got ...; remedy``.
-
-    ``where`` names a method or attribute of the user's class, ``rule`` what it must do, ``got`` the
-    wrong value (a text as it is, other values by repr; None omits it).
-    """
+    """Raise AssertionError with the line ``where: rule; got ...; remedy``."""
     message = f"{where}: {rule}"
     if got is not None:
         message += f"; got {got if isinstance(got, str) else quote(got)}"
@@ -46,11 +42,7 @@ def fail(where: str, rule: str, got: object = None, remedy: str = "") -> NoRetur
 
 
 def demand(holds: object, where: str, rule: str, got: object = None, remedy: str = "") -> None:
-    """Raise AssertionError with the line ``where: rule; got ...; remedy`` unless ``holds``.
-
-    ``where`` names a method or attribute of the user's class, ``rule`` what it must do, ``got`` the
-    wrong value (None omits it).
-    """
+    """Raise AssertionError with the line ``where: rule; got ...; remedy`` unless ``holds``."""
     if not holds:
         fail(where, rule, got, remedy)
 
@@ -58,10 +50,8 @@ def demand(holds: object, where: str, rule: str, got: object = None, remedy: str
 def make_part(
     part: Any, contracts: tuple[type[Component], ...], settings: Mapping[str, Any]
 ) -> Any:
-    """Return the object to check: ``part`` itself, or ``part(**settings)`` if it is a class.
-
-    Raises AssertionError if the class is derived from none of the ``contracts``, is abstract or
-    refuses the settings.
+    """Return ``part``, or ``part(**settings)`` of a class. Raises AssertionError if it is derived
+    from none of the ``contracts``, is abstract or refuses the settings.
     """
     cls = part if isinstance(part, type) else type(part)
     name = cls.__name__
@@ -92,9 +82,7 @@ _PLAIN = frozenset((str, bytes, bool, int, float, complex, type(None)))
 
 
 def collect_leaves(value: Any) -> Leaves:
-    """Return copies of all numbers, texts and arrays in a value, by their paths such as ``.P[0]``,
-    so that it can be found out later what has changed. Generators and callables are left out.
-    """
+    """Return copies of the numbers, texts and arrays in a value by path, such as ``.P[0]``."""
     leaves: Leaves = {}
     _add_leaves([("", value)], "", set(), leaves)
     return leaves
@@ -136,9 +124,7 @@ def _list_members(value: Any) -> Iterable[tuple[str, Any]]:
 
 
 def differing_path(one: Leaves, other: Leaves) -> str | None:
-    """Return the path, such as ``.P[0]``, of the first number, text or array in which two values
-    differ, given as the results of :func:`collect_leaves`; None if all are equal.
-    """
+    """Return the path of the first leaf in which two values differ, None if all are equal."""
     if one.keys() != other.keys():
         return (
             min(one.keys() ^ other.keys(), key=len, default="")
@@ -214,11 +200,8 @@ class WatchedPart:
         self._results: list[tuple[str, Any, Leaves]] = []
 
     def call(self, method: str, *arguments: Any, repeatable: bool = True) -> Any:
-        """Call a method, or a function of a value as "link_weights.of", check for side effects and
-        return the result.
-
-        A ``repeatable`` method, one that draws no random numbers, is called twice and must return
-        equal results. Raises AssertionError if a check or the method fails.
+        """Call a method, or a function such as "link_weights.of", check for side effects and return
+        the result. If ``repeatable`` it is called twice, with equal results. Raises AssertionError.
         """
         where = f"{self.name}.{method}"
         before = [collect_leaves(argument) for argument in arguments]
@@ -248,9 +231,7 @@ class WatchedPart:
         return _UncheckedPart(self.part)
 
     def attributes(self) -> Leaves:
-        """Return copies of the numbers, texts and arrays in the attributes of the user's object, by
-        their paths, except for cached properties, which a call may compute and store.
-        """
+        """Return copies of what the user's object holds, by path, without cached properties."""
         cls: Any = type(self.part)
         attributes = {
             name: value
@@ -287,18 +268,14 @@ class WatchedPart:
             demand(path is None, where, rule, remedy="return copies, share no buffers")
 
     def demand_unchanged(self, before: Leaves) -> None:
-        """Check that the attributes of the component are still those of ``before``, an earlier
-        result of :meth:`attributes`.
-        """
+        """Check that :meth:`attributes` are still those of ``before``."""
         path = differing_path(before, self.attributes())
         rule = f"must not change its own object, but changed {path}"
         remedy = "keep what changes in the paths and states that its methods return"
         demand(path is None, self.name, rule, remedy=remedy)
 
     def pickle_copy(self) -> Any:
-        """Return a copy of the user's object made by pickle, as for worker processes; check that it
-        is equal.
-        """
+        """Return a copy of the user's object made by pickle; check that it is equal."""
         try:
             copy = pickle.loads(pickle.dumps(self.part))
         except Exception as error:
@@ -323,9 +300,7 @@ class _UncheckedPart(WatchedPart):
 
 @contextmanager
 def guard_user_code(where: str) -> Iterator[None]:
-    """Turn exceptions of a user's class into an AssertionError of one line, which begins with
-    ``where``, and check that the body uses no global generator.
-    """
+    """Turn exceptions into an AssertionError of one line; refuse use of global generators."""
     before = global_generator_states()
     try:
         yield
@@ -339,9 +314,7 @@ def guard_user_code(where: str) -> Iterator[None]:
 
 
 def call_user_function(where: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a ``function`` of a user's class with the ``arguments`` and return the result; an
-    exception becomes an AssertionError that names ``where``.
-    """
+    """Call a user's ``function``; an exception becomes an AssertionError that names ``where``."""
     with guard_user_code(where):
         return function(*arguments)
 
@@ -349,11 +322,7 @@ def call_user_function(where: str, function: Callable[..., Any], *arguments: Any
 def demand_array(
     where: str, name: str, value: Any, shape: tuple[int, ...], remedy: str = ""
 ) -> FloatArray:
-    """Return ``value`` as an array of the given ``shape``.
-
-    Raises AssertionError unless it is float64, finite and of that shape; ``where`` and ``name`` are
-    what messages call its origin and the array, ``remedy`` what to do where it is not finite.
-    """
+    """Return ``value`` as an array; AssertionError unless float64, finite and of ``shape``."""
     array = np.asarray(value)
     demand(array.shape == shape, where, f"{name} must have the shape {shape}", str(array.shape))
     demand(array.dtype == np.float64, where, f"{name} must be float64", str(array.dtype))
@@ -362,9 +331,7 @@ def demand_array(
 
 
 def scaled_difference(one: FloatArray, other: FloatArray) -> float:
-    """Return the largest absolute difference of two arrays of one shape (any), divided by 1 + the
-    largest absolute entry of both.
-    """
+    """Return the largest absolute difference over 1 + the largest absolute entry of both."""
     size = 1.0 + max(np.abs(a).max(initial=0.0) for a in (one, other))
     return float(np.abs(one - other).max(initial=0.0) / size)
 
@@ -372,9 +339,7 @@ def scaled_difference(one: FloatArray, other: FloatArray) -> float:
 def demand_close(
     one: FloatArray, other: FloatArray, where: str, rule: str, when: str = "", remedy: str = ""
 ) -> None:
-    """Raise AssertionError with the line ``where: rule; got ... ; remedy`` unless two arrays of one
-    shape are equal up to ROUNDING; ``when`` says how they were made.
-    """
+    """Raise AssertionError unless two arrays of one shape are equal up to ROUNDING."""
     difference = scaled_difference(one, other)
     got = f"a difference of {difference:.3g} of their size {when}".rstrip()
     demand(difference <= ROUNDING, where, rule, got, remedy)

@@ -34,9 +34,7 @@ MAX_TABLE = 1 << 22
 
 @lru_cache(maxsize=8)
 def network_clocks(scenario: Scenario) -> ClockGroup:
-    """Return the clocks of the network that are compared with their stated laws, one for each node
-    or link; empty if no messages are sent or no clock decides when.
-    """
+    """Return the clocks of nodes or links that are compared with their laws; maybe empty."""
     clock = scenario.network.activation
     if not scenario.filter.algorithm.timing.talks or not isinstance(clock, LinkClock):
         return NO_CLOCKS
@@ -81,9 +79,8 @@ def sampling_clocks(scenario: Scenario) -> ClockGroup:
 
 
 def ticks_of(scenario: Scenario, run: Run) -> TickCounts | None:
-    """Return the counts of the ticks of a run by which the clocks of the network are compared with
-    their laws, None without clocks. Of links that tick in contacts only they are counted in the
-    time of contacts, and ``off`` is the largest distance of a tick from a contact of its link.
+    """Return counts of ticks, None without clocks. Links that tick in contacts are counted in the
+    time of contacts; ``off`` is the largest distance of a tick from one.
     """
     group = network_clocks(scenario)
     if not group.entities:
@@ -111,9 +108,7 @@ def ticks_of(scenario: Scenario, run: Run) -> TickCounts | None:
 
 
 def samples_of(scenario: Scenario, streams: Streams) -> TickCounts | None:
-    """Return the counts of the samples of a run by which the sampling clocks of sensors are
-    compared with their laws, drawn again from its ``streams``; None without clocks.
-    """
+    """Return counts of samples of sensors, drawn again from ``streams``; None without clocks."""
     group = sampling_clocks(scenario)
     if not group.entities:
         return None
@@ -124,9 +119,7 @@ def samples_of(scenario: Scenario, streams: Streams) -> TickCounts | None:
 
 
 def count_drawn_ticks(scenario: Scenario, seed: int, replica: int) -> np.ndarray:
-    """Return how often each of E clocks of the network ticks in one ``replica`` of the runs of
-    ``seed``, (E,), drawn from the clocks' streams without simulating anything else.
-    """
+    """Return how often each of E clocks ticks in a ``replica``, (E,), drawn again."""
     ticks = draw_ticks(scenario, network_clocks(scenario).entities, seed, replica)
     return np.array([len(times) for times in ticks])
 
@@ -134,9 +127,7 @@ def count_drawn_ticks(scenario: Scenario, seed: int, replica: int) -> np.ndarray
 def draw_ticks(
     scenario: Scenario, entities: Sequence[Entity], seed: int, replica: int
 ) -> list[FloatArray]:
-    """Return the times in seconds of the ticks of each of the ``entities`` of the network's clock,
-    drawn again from the streams of one ``replica`` of the runs of ``seed``.
-    """
+    """Return the ticks (s) of each of the ``entities`` in a ``replica``, drawn again."""
     clock: Any = scenario.network.activation
     streams, horizon = Streams(seed, replica), scenario.horizon
     ticks = (
@@ -153,9 +144,7 @@ def draw_ticks(
 
 
 def count_drawn_samples(scenario: Scenario, seed: int, replica: int) -> np.ndarray:
-    """Return how often each of E sensors samples in one ``replica`` of the runs of ``seed``, (E,),
-    drawn from the sensors' streams without simulating anything else.
-    """
+    """Return how often each of E sensors samples in a ``replica``, (E,), drawn again."""
     times = scenario.sample_times(Streams(seed, replica))
     return np.array([len(times[entity]) for entity in sampling_clocks(scenario).entities])
 
@@ -200,9 +189,7 @@ def _redraws_links(scenario: Scenario) -> bool:
 
 
 def losses_of(scenario: Scenario, run: Run) -> LossCounts | None:
-    """Return the counts of sent and lost messages of a run, in windows of it and for each of D
-    directions, and of losses that follow or accompany each other; None without links.
-    """
+    """Return counts of sent and lost messages by window and direction; None without links."""
     directions, log = scenario.topology.directions, run.log
     sends, losses = (log[log["kind"] == CODES[kind]] for kind in ("send", "lost"))
     if not directions:
@@ -262,10 +249,7 @@ def _places(entities: Sequence[Entity], columns: Sequence[np.ndarray]) -> IntArr
 
 
 def pairs_of(scenario: Scenario, run: Run) -> PairCounts | None:
-    """Return for each of L links the number (L,) of slots of a run in which it was in the matching
-    (the pairs of nodes that exchange in a slot), and in which it was in two matchings in a row;
-    None without drawn matchings.
-    """
+    """Return for L links the slots in the matching, and in two in a row; None if not drawn."""
     if not isinstance(scenario.network.activation, Matching):
         return None
     links = {link: k for k, link in enumerate(scenario.topology.links)}
@@ -294,10 +278,8 @@ def stated_delay(scenario: Scenario) -> tuple[float | None, Any]:
 
 
 def delays_of(scenario: Scenario, run: Run) -> DelayCounts | None:
-    """Return counts by which the delays of the messages of a run are compared with their stated
-    law, over D directions; None without links or a stated law.
-
-    Messages that have not arrived when the run ends take longer than that.
+    """Return counts of delays by direction, None without links or a stated law. Messages that have
+    not arrived when the run ends take longer than that.
     """
     (fixed, law), count = stated_delay(scenario), len(scenario.topology.directions)
     rows = run.log[np.isin(run.log["kind"], (CODES["deliver"], CODES["late"]))]

@@ -195,9 +195,7 @@ def _of_losses(compare: Callable[..., Comparison], tolerance: float) -> Test:
 
 @lru_cache(maxsize=8)
 def pair_probabilities(scenario: Scenario) -> FloatArray | None:
-    """Return the stated probability (L,) that each of L links is in the matching of a slot (the
-    pairs of nodes that exchange); None if it is not known.
-    """
+    """Return the probability (L,) of each link to be in a matching; None if unknown."""
     stated = stated_part(scenario.network.activation, "slot activation")
     if not isinstance(stated, Matching):
         return None
@@ -282,9 +280,7 @@ DELAY_LAW = _row(
 
 
 def loss_assumptions(scenario: Scenario) -> list[Assumption]:
-    """Return the assumptions of tests of losses, each with whether it holds: there is a law, it is
-    stated, and it is the same for all messages of a link.
-    """
+    """Return assumptions of tests of losses: a stated law, one for all messages of a link."""
     channel, law = scenario.network.channel, loss_law(scenario)
     loss: Any = stated_part(channel.loss, "loss")
     drawn, why = True, "links are up unless a message is lost"
@@ -308,9 +304,7 @@ def loss_assumptions(scenario: Scenario) -> list[Assumption]:
 
 
 def network_promises(samples: PartSamples) -> list[Promise]:
-    """Return what the scenario states about its clocks, matchings, losses and delays, as promises
-    that the runs can test; parts without a stated law have none.
-    """
+    """Return promises about clocks, matchings, losses and delays with a stated law."""
     scenario = samples.scenario
     if scenario.network.lives:
         # Who is down does not tick, and what it would hear is lost.

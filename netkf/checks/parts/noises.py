@@ -53,9 +53,7 @@ class PathLaw(NamedTuple):
 
 @lru_cache(maxsize=8)
 def path_law(scenario: Scenario) -> PathLaw | None:
-    """Return the law of the true state at up to MAX_STEPS + 1 times of a run, by the matrices of
-    the scenario; None for recorded states, and for dynamics that are not linear.
-    """
+    """Return the law of the state at up to MAX_STEPS + 1 times; None if recorded or nonlinear."""
     if not scenario.plant.is_random or not scenario.plant.linear:
         return None
     stated: Any = stated_part(scenario.plant, "plant")
@@ -98,9 +96,7 @@ def _step_law(plant: Diffusion, start: float, end: float) -> tuple[FloatArray, F
 
 
 def plant_noises(scenario: Scenario, streams: Streams) -> NoiseDraws | None:
-    """Return the plant's noise in the steps of one run's true path, whitened by its stated
-    covariance to d entries; None for plants without noise and for recorded states.
-    """
+    """Return the whitened noise of the plant in the steps of a run; None without noise."""
     law = path_law(scenario)
     if law is None or not law.white.size:
         return None
@@ -128,18 +124,14 @@ def _states(scenario: Scenario, streams: Streams, law: PathLaw) -> FloatArray:
 
 @lru_cache(maxsize=8)
 def _choose_times(scenario: Scenario) -> Scenario:
-    """Return the scenario with states at the times of its path law, without the response to an
-    input, which is no noise; cached for its tables.
-    """
+    """Return the scenario with states at the times of its path law, without an input."""
     law = path_law(scenario)
     assert law is not None
     return dataclasses.replace(scenario.undriven, probe=law.times)
 
 
 def start_states(scenario: Scenario, seed: int, count: int) -> FloatArray:
-    """Return x(0) (count, n) of replicas 0 to ``count`` - 1 of the runs of ``seed``, each drawn
-    from the replica's own stream as a run would draw it.
-    """
+    """Return x(0) (count, n) of the first ``count`` replicas, from their own streams."""
     # Built-in classes draw all replicas in one call, with the same numbers as one by one.
     if type(scenario.plant) in (LinearPlant, Diffusion, NonlinearPlant, NonlinearDiffusion):
         states = ReplicaStreams(seed, 0, count).states("plant", [()])
@@ -170,9 +162,7 @@ class SensorLaw(NamedTuple):
 
 @lru_cache(maxsize=8)
 def sensor_laws(scenario: Scenario) -> tuple[SensorLaw, ...]:
-    """Return the laws by which readings are whitened, one for each sensor with drawn (not recorded)
-    noise, until their readings together have MAX_ROWS rows.
-    """
+    """Return the laws of sensors with drawn noise, until readings have MAX_ROWS rows together."""
     laws: list[SensorLaw] = []
     rows = 0
     for node, placed_sensors in scenario.placed_sensors.items():
@@ -203,8 +193,7 @@ def reading_labels(scenario: Scenario) -> list[str]:
 
 
 def reading_noises(scenario: Scenario, streams: Streams) -> NoiseDraws | None:
-    """Return the noises of the sensors' first readings in the run of ``streams``, whitened by their
-    stated covariances to d entries; None without drawn sensors.
+    """Return whitened noises of the first readings of a run; None without drawn sensors.
 
     Sensors read states drawn here, of typical size, since their noise must not depend on the state.
     The k-th noises of all sensors form one vector; entries of sensors with fewer readings are nan.

@@ -66,11 +66,8 @@ def _correlation(group: str, samples: PartSamples, level: float) -> Finding:
 
 
 def gaussian_noises(samples: PartSamples) -> Assumption:
-    """Return the assumption that all noises are Gaussian, a row of the table of assumptions, which
-    tests of squared errors need.
-
-    Built-in noises are Gaussian; those of a user's class, which states only a covariance, are
-    tested by how they fill cells that have equal probability under the normal law.
+    """Return the assumption that all noises are Gaussian, which tests of squared errors need:
+    built-in ones are, those of a user's class are tested by how they fill cells.
     """
     plant, groups = samples.scenario.plant, []
     if samples.steps is not None:
@@ -126,9 +123,7 @@ def part_assumptions(samples: PartSamples) -> list[Assumption]:
 
 
 def part_promises(samples: PartSamples) -> tuple[Promise, ...]:
-    """Return what a scenario itself states about its start, plant, sensors, clocks, channels and
-    matchings, as promises that these samples can test; a user's own class may break one.
-    """
+    """Return promises about start, plant, sensors, clocks, channels and matchings."""
     scenario = samples.scenario
     promises: list[Promise] = []
     if scenario.plant.is_random and np.any(scenario.plant.start_cov):

@@ -48,10 +48,7 @@ PART_TYPES: dict[str, type[Any]] = dict(
 
 
 def summarise_parts(scenario: Scenario, run: Run) -> PartSummary:
-    """Return counts and draws of a run, by which the parts of the scenario are compared with the
-    laws that they state; called for every replica, in the process that simulated it. Noises are
-    drawn again from the run's streams.
-    """
+    """Return counts and draws of a run to compare parts with their laws; noises are drawn again."""
     streams = Streams(run.seed, run.replica)
     return PartSummary(
         ticks=ticks_of(scenario, run),

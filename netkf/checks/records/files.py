@@ -31,9 +31,9 @@ class FilesUnknownError(Exception):
 
 
 def files_fault(scenario: Scenario, run: Run, engine: Engine) -> str:
-    """Return one line about the first difference between a ``run`` in memory and the files that
-    ``netkf run`` and ``netkf.save`` write of it, simulated again by ``engine``; empty without one.
-    Raises FilesUnknownError if files cannot be written.
+    """Return the first difference between ``run`` and the files that ``netkf run`` and
+    ``netkf.save`` write of it; empty without one. Raises FilesUnknownError if files cannot be
+    written.
     """
     seeded = dataclasses.replace(scenario, seed=run.seed)
     try:
@@ -91,9 +91,7 @@ def _tables_fault(run: Run, stored: StoredRun) -> str:
 
 
 def _squares(run: Run) -> tuple[FloatArray, FloatArray]:
-    """Return e' e and e' P^-1 e (T, N), the latter nan where P is not well conditioned, which
-    decides nothing here.
-    """
+    """Return e' e and e' P^-1 e (T, N), nan where P is not well conditioned."""
     e, P = without_padding(run.error, run.P)
     finite = np.asarray(np.isfinite(P).all(axis=(2, 3)))
     P = np.where(finite[..., None, None], P, np.eye(P.shape[-1]))
