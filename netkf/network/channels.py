@@ -133,18 +133,14 @@ class BroadcastSampler:
 
 
 def draws_per_link(channel: Channel) -> bool:
-    """Return True if each link has draws of its own, with one law for all links, whatever is sent
-    when.
-    """
+    """Return True if each link has draws of its own, with one law for all."""
     loss = channel.loss
     one_chain = not isinstance(loss, GilbertElliott) or loss.path is None
     return one_chain and channel.channels is None and not channel.draws_for_senders
 
 
 def has_identical_links(channel: Channel) -> bool:
-    """Return True if neither fate nor delay of a message depends on its number, its time or the
-    state of its link.
-    """
+    """Return True if fates and delays depend on no number, time or state."""
     same_fate = identical_per_link(channel.loss) and channel.channels is None
     return same_fate and not delay_depends_on_message(channel.delay)
 
@@ -182,9 +178,7 @@ class Broadcasts:
         self._last: dict[int, BroadcastDraw] = {}
 
     def begin(self, senders: Iterable[int], fresh: bool = True) -> None:
-        """Draw the next broadcast of each of the ``senders``, or unless it is ``fresh`` keep the
-        last one.
-        """
+        """Draw the next broadcast of ``senders``, or unless ``fresh`` keep the last one."""
         for sender in senders:
             if sender in self._samplers and (fresh or sender not in self._last):
                 self._last[sender] = self._samplers[sender].draw()
@@ -227,9 +221,8 @@ class ChannelSampler:
     def __init__(
         self, channel: Channel, link: Link, generator: Callable[[str], np.random.Generator]
     ) -> None:
-        """Make the random streams that the channel draws from for a ``link``, by
-        ``generator(purpose)``, one for each purpose, so that losses, channel states and delays do
-        not depend on each other's number of draws.
+        """Make a stream of ``generator(purpose)`` for each purpose, so that losses, states and
+        delays do not depend on each other's number of draws.
         """
         self._loss, self._delay, self._link = channel.loss, channel.delay, link
         self._fixed_delay = channel.delay.fixed or 0.0
@@ -240,9 +233,7 @@ class ChannelSampler:
         self._delay_random = streams.get("delay")
 
     def draw(self) -> ChannelDraw:
-        """Return the random numbers of the next activation of the link, which decide whether and
-        when its messages arrive; a delay that is not random is the fixed one or 0.
-        """
+        """Return the numbers of the next activation; a fixed delay is itself, or 0."""
         uniform, bad, delay = 0.0, False, self._fixed_delay
         if self._loss_random is not None:
             uniform = float(self._loss_random.random())
@@ -253,10 +244,8 @@ class ChannelSampler:
         return ChannelDraw(uniform, bad, delay)
 
     def draws(self, count: int) -> tuple[FloatArray, np.ndarray, FloatArray]:
-        """Return the numbers of the next ``count`` activations: uniform numbers, states (True: bad)
-        and delays in seconds, (count,) each.
-
-        They equal the results of ``count`` calls of ``draw``.
+        """Return uniform numbers, states (True: bad) and delays (s) of ``count`` activations,
+        (count,) each, equal to those of ``draw``.
         """
         uniform, bad = np.zeros(count), np.zeros(count, dtype=bool)
         if self._loss_random is not None:
@@ -291,11 +280,8 @@ def conditions_of(loss: Loss, streams: Streams, horizon: float) -> Any:
 
 
 def transit_time(channel: Channel, sent: Transmission, draw: ChannelDraw) -> float:
-    """Return the seconds that the message ``sent`` takes to arrive, decided by the random numbers
-    ``draw``.
-
-    The result is nan if the message is lost. Raises ScenarioError for a delivery probability
-    outside [0, 1] and for a negative delay.
+    """Return the seconds that ``sent`` takes by its ``draw``, nan if lost; raises ScenarioError for
+    a probability outside [0, 1] and a negative delay.
     """
     delivery = checked_delivery_probability(channel.loss, sent)
     if channel.channels is not None:

@@ -422,9 +422,7 @@ class RecordedClock(LinkClock):
 
     @property
     def row_keys(self) -> list[tuple[Entity, float]]:
-        """The entity and the time in seconds of each row, in the order of the table; equal ones are
-        one tick.
-        """
+        """The entity and the time (s) of each row, in order; equal ones are one tick."""
         return self._rows[0]
 
     def ticks(

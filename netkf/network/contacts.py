@@ -123,18 +123,14 @@ class Contacts(LinkClock):
         return inside
 
     def time_in_contact(self, entity: Entity, times: FloatArray) -> FloatArray:
-        """Return how long (K,) a link has been in contact from 0 until each of ``times`` (K,), in
-        seconds.
-        """
+        """Return how long (K,) a link has been in contact until ``times`` (K,), in seconds."""
         begins, ends = self._intervals.get(entity, (np.empty(0), np.empty(0)))
         begins, ends = np.maximum(begins, 0.0), np.maximum(ends, 0.0)
         lengths = np.clip(times[:, None] - begins, 0.0, ends - begins)
         return np.asarray(lengths.sum(axis=1))
 
     def distance(self, entity: Entity, times: FloatArray) -> float:
-        """Return the largest distance in seconds of one of ``times`` (K,) from the contacts of a
-        link; infinite if it has none.
-        """
+        """Return the largest distance (s) of ``times`` from contacts of a link, or inf."""
         begins, ends = self._intervals.get(entity, (np.empty(0), np.empty(0)))
         off = np.maximum(begins - times[:, None], times[:, None] - ends)
         return float(np.maximum(off.min(axis=1, initial=math.inf), 0.0).max(initial=0.0))

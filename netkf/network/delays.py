@@ -150,9 +150,7 @@ class LognormalDelay(Delay):
 
 
 def draw_delays(delay: Delay, random: np.random.Generator, count: int) -> FloatArray:
-    """Return delays (count,) in seconds, equal to those of ``count`` calls of ``delay.draw``, but
-    drawn at once where the law is a built-in one.
-    """
+    """Return delays (count,) in seconds, as of ``delay.draw``, at once for a built-in law."""
     # By exact type: a subclass may override draw.
     if type(delay) is ExponentialDelay:
         return delay.mean * random.standard_exponential(count)
@@ -162,16 +160,12 @@ def draw_delays(delay: Delay, random: np.random.Generator, count: int) -> FloatA
 
 
 def delay_depends_on_message(delay: Delay) -> bool:
-    """Return True if the class overrides ``message_delay``, so that delays may depend on the
-    message.
-    """
+    """Return True if the class overrides ``message_delay``."""
     return type(delay).message_delay is not Delay.message_delay
 
 
 def checked_delay(delay: Delay, sent: Transmission, drawn: float) -> float:
-    """Return the seconds that the message ``sent`` takes, nan if it is lost, from the delay
-    ``drawn`` for it; raises ScenarioError if the delay model gives a negative one.
-    """
+    """Return the seconds that ``sent`` takes, nan if lost; raises ScenarioError if negative."""
     seconds = delay.message_delay(sent, drawn)
     if seconds < 0.0:
         rule = (

@@ -149,11 +149,8 @@ def _read_links(graph: networkx.Graph[Any], path: str) -> LinkTable:
 
 
 def from_networkx(graph: networkx.Graph[Any]) -> Edges:
-    """Return the nodes and links of a networkx graph, with the attribute ``delivery_probability``
-    of its edges, and the places of nodes with an attribute ``pos``, or ``x`` and ``y``.
-
-    Nodes are named by their texts; integers are ids. Raises ScenarioError, at no key, for an edge
-    that is no link, and for two values of one link.
+    """Return nodes and links of a networkx graph, its ``delivery_probability``, and places by
+    ``pos``, or ``x`` and ``y``; integers are ids, texts names. Raises ScenarioError.
     """
     table = _read_links(graph, "graph")
     labels = {k: name for name, k in table.names.items()}

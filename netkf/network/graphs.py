@@ -77,9 +77,7 @@ def node_columns(node: int) -> dict[str, Any]:
 
 
 def name_rows(rows: Iterable[dict[str, Any]]) -> None:
-    """Put named ids in the place of ``node`` in rows of a document that was read, in place, where
-    they have a ``name``.
-    """
+    """Put named ids in the place of ``node`` in rows that have a ``name``."""
     for row in rows:
         if isinstance(row.get("name"), str):
             row["node"] = NamedNode(row["node"], row["name"])
@@ -209,9 +207,7 @@ def demand_in_graph(nodes: Sequence[int], topology: Topology) -> None:
 
 
 def demand_links(source: SourceFile, lines: Mapping[Link, int], topology: Topology) -> None:
-    """Raise ScenarioError if a file, such as one of recorded exchanges, names a pair (sender,
-    receiver) that is not a link of the graph; ``lines`` has a line number of each pair.
-    """
+    """Raise ScenarioError if a file has a pair that is no link, at one of its ``lines``."""
     links = set(topology.links)
     if not topology.directed:
         links |= {(j, i) for i, j in links}
@@ -222,9 +218,7 @@ def demand_links(source: SourceFile, lines: Mapping[Link, int], topology: Topolo
 
 
 def demand_nodes(source: SourceFile, lines: Mapping[int, int], topology: Topology) -> None:
-    """Raise ScenarioError if a file names a node (id) that the graph does not have; ``lines`` has a
-    line number of each node.
-    """
+    """Raise ScenarioError if a file has a node that is not there, at one of its ``lines``."""
     unknown = min(lines.keys() - topology.index.keys(), key=lines.__getitem__, default=None)
     if unknown is not None:
         rule = f"{source.name} line {lines[unknown]} names a node that the graph does not have"
@@ -572,9 +566,7 @@ class RangeGraph(Graph):
 
 
 def assign_ids(labels: Iterable[Any]) -> dict[Any, int]:
-    """Return the id of each node by its label, in the order of first labels: integers, also as
-    text, keep theirs, and other labels get the smallest integers that are free.
-    """
+    """Return the ids of nodes by label: integers keep theirs, others get free ones in order."""
     ids = {label: _as_integer(label) for label in labels}
     taken = {k for k in ids.values() if k is not None}
     free = (k for k in itertools.count() if k not in taken)
@@ -606,10 +598,8 @@ class LinkTable:
     names: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
     def topology(self, minimum: float | None, positions: SourceFile | None) -> Topology:
-        """Return the network of the links that reach the ``minimum`` probability, in both
-        directions if links are undirected, with the places of the table ``positions``.
-
-        Raises ScenarioError if no link is left, or if the table does not fit.
+        """Return the network of links that reach the ``minimum``, if undirected both ways, with a
+        table of ``positions``; raises ScenarioError without a link.
         """
         if minimum is not None and not self.has_probabilities:
             rule = "needs a column delivery_probability in the table"
@@ -643,9 +633,7 @@ class LinkTable:
         )
 
     def _both_ways(self) -> dict[Link, float]:
-        """Return the probability by direction: unless links are listed both ways, or are directed,
-        each row counts both ways.
-        """
+        """Return probabilities by direction; a row counts both ways unless both are listed."""
         listed = self.probability
         if self.directed or any((j, i) in listed for i, j in listed):
             return listed

@@ -465,9 +465,7 @@ class GilbertElliott(Loss):
 
 
 def identical_per_link(loss: Loss) -> bool:
-    """Return True if all messages of a directed link have the same delivery probability, as long as
-    nodes stay where they are.
-    """
+    """Return True if a directed link has one delivery probability while nodes stay."""
     # By exact type: a subclass may override delivery_probability.
     return type(loss) in (NoLoss, Bernoulli, SharedLoss, PerLink, DistanceLoss)
 
@@ -488,9 +486,7 @@ def _is_vectorised(loss: Loss) -> bool:
 
 
 def delivery_probabilities(loss: Loss, sent: Transmission) -> FloatArray:
-    """Return the delivery probabilities (K,) of K messages ``sent`` on one link, by the loss model,
-    which may be a user's own. Raises ScenarioError for a value outside [0, 1].
-    """
+    """Return checked probabilities (K,) of messages ``sent`` on a link; raises ScenarioError."""
     if _is_vectorised(loss):
         values = np.broadcast_to(loss.delivery_probability(sent), np.shape(sent.number))
         _demand_probabilities(loss, sent, values)
@@ -505,9 +501,7 @@ def delivery_probabilities(loss: Loss, sent: Transmission) -> FloatArray:
 
 
 def checked_delivery_probability(loss: Loss, sent: Transmission) -> float:
-    """Return the probability that the message ``sent`` arrives; raises ScenarioError if the loss
-    model gives one outside [0, 1].
-    """
+    """Return the probability that ``sent`` arrives; raises ScenarioError outside [0, 1]."""
     value: float = loss.delivery_probability(sent)
     if not 0.0 <= value <= 1.0:
         _demand_probabilities(loss, sent, np.array(value))

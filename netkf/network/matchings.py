@@ -196,9 +196,7 @@ def _choose_greedily(links: list[Link]) -> list[Link]:
 
 @lru_cache(maxsize=8)
 def maximal_matchings(links: tuple[Link, ...]) -> tuple[tuple[Link, ...], ...]:
-    """Return all maximal matchings of a graph, sets of links without a common node to which no link
-    can be added, each sorted, in sorted order.
-    """
+    """Return all maximal matchings of a graph, each sorted, in sorted order."""
     matchings: set[tuple[Link, ...]] = set()
 
     def extend(chosen: tuple[Link, ...], free: tuple[Link, ...]) -> None:
@@ -337,9 +335,8 @@ def used_links(
     step: tuple[int, int, int],
     pairwise: bool,
 ) -> tuple[list[Link], set[Link] | None]:
-    """Return the links used in a ``step``, (slot, phase, repeat), and those directions of them that
-    are up (None: all). Matchings are drawn from ``random``, one stream for the whole network;
-    ``pairwise``: nodes swap with a peer, instead of absorbing broadcasts.
+    """Return the links used in a ``step``, (slot, phase, repeat), and their directions that are up
+    (None: all); matchings are drawn from ``random``.
     """
     if isinstance(activation, Matching):
         return activation.draw(topology, random), None

@@ -83,10 +83,8 @@ class NodeTime(NamedTuple):
         return self.grid.instant(self.offset + self.pace * time)
 
     def ahead(self, clock: Clock) -> float:
-        """Return how far the law of ticks of a ``clock`` is ahead of this one at time 0, seconds.
-
-        Rows of a table are local times. A lattice is one of local times, begun before time 0 if
-        this clock shows less or more. Others count gaps from time 0 on.
+        """Return how far ticks of a ``clock`` are ahead at time 0 (s): rows of a table and lattices
+        are in local time, others count gaps from 0 on.
         """
         if isinstance(getattr(clock, "path", None), SourceFile):
             return -self.offset
@@ -100,9 +98,7 @@ class NodeTime(NamedTuple):
         return self.pace * time - ahead
 
     def instants(self, ticks: FloatArray, ahead: float) -> FloatArray:
-        """Return the instants of ``ticks`` (K,), in seconds of their law, without those that were
-        before the start.
-        """
+        """Return instants of ``ticks`` (K,), in s of their law, without those before the start."""
         times = self.grid.snap((ticks + ahead) / self.pace)
         return times[times > 0.0] if ahead < 0.0 else times
 
@@ -129,7 +125,5 @@ def node_times(scenario: Any, streams: Any) -> dict[int, NodeTime]:
 
 
 def owner_of(clock: LinkClock, entity: tuple[int, ...]) -> int:
-    """Return the node (id) by whose clock ``entity`` ticks, -1 if by none: a link belongs to both
-    ends, and contacts are facts of the world.
-    """
+    """Return whose clock ``entity`` ticks by, -1 without: a link has two ends, contacts none."""
     return -1 if clock.at == "links" or isinstance(clock, Contacts) else entity[0]

@@ -47,10 +47,8 @@ class PositionTable:
 
 
 def read_positions(source: SourceFile, topology: Topology, grid: TimeGrid) -> PositionTable:
-    """Read a table of positions, with its times on the ``grid``.
-
-    Raises ScenarioError for a node that the graph does not have, for two places of a node at one
-    time, and for a node whose first row is after 0.
+    """Read a table of positions with times on the ``grid``; raises ScenarioError for an unknown
+    node, two places at one time, and a first row after 0.
     """
     timed = "t" in read_header(source)
     columns = read_columns(source, ("t", "node", "x", "y") if timed else ("node", "x", "y"))

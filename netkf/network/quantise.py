@@ -55,9 +55,7 @@ class Encoder:
         self._quantisation, self._random = quantisation, random
 
     def encode(self, payload: Any) -> tuple[Any, int]:
-        """Return the payload that is received, and how many numbers in it were clipped: those of
-        its arrays, in tuples and messages of kernels alike.
-        """
+        """Return the payload that is received, and how many of its numbers were clipped."""
         if isinstance(payload, np.ndarray):
             return self._encode_array(payload) if payload.dtype == np.float64 else (payload, 0)
         if hasattr(payload, "fields"):

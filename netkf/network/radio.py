@@ -50,9 +50,7 @@ class Airtime:
         self._end.pop(sender, None)
 
     def end(self, sender: int, size: float, now: float) -> float:
-        """Return when the last bit of the present transmission of ``sender``, of ``size`` bytes, is
-        sent; nan if it is dropped.
-        """
+        """Return when the last bit of ``size`` bytes of ``sender`` is sent; nan if dropped."""
         if sender not in self._end:
             free = self._free.get(sender, 0.0)
             if free > now and self.radio.queue == "drop":

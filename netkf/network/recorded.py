@@ -68,9 +68,7 @@ class MessageTable:
         return value
 
     def use(self, sent: Mapping[Link, int]) -> tuple[RowUse, int]:
-        """Return the use of the rows by a run with ``sent`` messages on each directed link, and how
-        many of these messages the table does not list.
-        """
+        """Return the use of rows by ``sent`` messages, and how many are not listed."""
         use = count_rows(
             self.source.name, self.row_keys, lambda key: key[2] < sent.get((key[0], key[1]), 0)
         )
@@ -80,11 +78,8 @@ class MessageTable:
 def read_messages(
     source: SourceFile, column: str, rule: str, allowed: Callable[[float], bool]
 ) -> MessageTable:
-    """Read a table of recorded losses or delays, a file ``sender,receiver,message,COLUMN`` with
-    COLUMN = ``column``; a message may be repeated with equal value.
-
-    Raises ScenarioError with the text ``rule`` for a value that is not ``allowed``, and for
-    different values of one message.
+    """Read recorded losses or delays ``sender,receiver,message,COLUMN``. Raises ScenarioError with
+    ``rule`` for a value that is not ``allowed``, and for two values of a message.
     """
     names = ("sender", "receiver", "message")
     table = read_columns(source, (*names, column))

@@ -59,9 +59,7 @@ class ScheduledLoss(Loss):
 
     @cached_property
     def _steps(self) -> tuple[dict[Link, tuple[FloatArray, FloatArray]], dict[Link, int]]:
-        """Return by directed link the times (K,) from which its probabilities (K,) hold, and the
-        number of the first line of each.
-        """
+        """Return times (K,) and probabilities (K,) by link, and first line numbers."""
         table = _read_deliveries(self.path, ("from", "until", "sender", "receiver"))
         begins, ends, values = (table[name].tolist() for name in ("from", "until", "delivery"))
         links = list(zip(table.integers("sender"), table.integers("receiver"), strict=True))

@@ -11,10 +11,8 @@ MAX_DENSE = 400
 
 
 def largest_laplacian_eigenvalue(degrees: FloatArray, ends: np.ndarray) -> float:
-    """Return the largest eigenvalue of the Laplacian of an undirected graph.
-
-    ``degrees`` (N,) are the numbers of links at each node, ``ends`` (L, 2) the indices of the two
-    nodes of each of L links.
+    """Return the largest eigenvalue of the Laplacian of an undirected graph with ``degrees`` (N,)
+    and ``ends`` (L, 2) of links, as indices.
     """
     if not len(ends):
         return 0.0

@@ -173,9 +173,8 @@ class ConnectivitySink(Sink):
             yield newest_heard(rows[first:last], t)
 
     def entry(self) -> dict[str, Any]:
-        """Return the entry of summary.json: the share of samples at which the network is connected,
-        the mean number of its components, and, unless messages tell it, the share at which each
-        link is up.
+        """Return the entry of summary.json: share of samples connected, mean number of components,
+        and, unless messages tell it, by link the share of samples at which it is up.
         """
         count, topology = max(self.count, 1), self._scenario.topology
         shares = dict(zip(topology.directions, (self.up / count).tolist(), strict=True))
@@ -197,17 +196,13 @@ class ConnectivitySink(Sink):
         return entry
 
     def shares(self) -> FloatArray:
-        """Return the share of samples (N + 1,) at which each node is up and no part is larger than
-        its own, and that at which the nodes that are up are one part; nan without samples.
-        """
+        """Return shares (N + 1,) of samples with each node in a largest part, and all in one."""
         with np.errstate(invalid="ignore"):
             return np.append(self.nodes_connected, self.connected) / np.float64(self.count)
 
 
 def newest_heard(arrivals: np.ndarray, t: FloatArray) -> FloatArray:
-    """Return when the newest message that has arrived by ``t`` (T,) was sent, in seconds, 0 without
-    one; ``arrivals`` (K,) are EVENT rows in the order of time.
-    """
+    """Return when the newest message that arrived by ``t`` (T,) was sent (s), 0 without one."""
     # A message that overtakes others makes them old before they arrive.
     sent = np.maximum.accumulate(arrivals["t"] - np.nan_to_num(arrivals["age"]))
     place = np.searchsorted(arrivals["t"], t, side="right")

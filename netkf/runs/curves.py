@@ -35,9 +35,7 @@ class ErrorCurve(NamedTuple):
 
 
 def squares_over_time(batch: RunBatch, rows: np.ndarray) -> FloatArray:
-    """Return the squared errors (R, K) of R runs at the samples ``rows`` (K,), mean of all nodes;
-    nan after the end of a run that diverged.
-    """
+    """Return squared errors (R, K) at samples ``rows``, mean of nodes, nan after divergence."""
     error = batch.error[:, rows]  # nan in components that a node does not estimate
     found = np.nansum(error * error, axis=3).mean(axis=2)
     ends = batch.lengths - batch.diverged

@@ -16,14 +16,11 @@ from netkf.runs.files import create_output_directory, make_directory
 
 @contextlib.contextmanager
 def lock_directory(directory: Path | None, must_be_empty: bool = False) -> Iterator[None]:
-    """Create a directory and hold its lock during the body; do nothing for None.
+    """Create a directory and hold its lock, which dies with the process, during the body; nothing
+    for None. Notes where locks are not supported; removes a new directory that stays empty.
 
-    The operating system releases the lock if this process dies. A directory that was created here
-    and is still empty at the end is removed. Prints a note if the file system does not support
-    locks.
-
-    Raises ScenarioError if another command holds the lock, if the directory cannot be created, or
-    if it ``must_be_empty`` and is not.
+    Raises ScenarioError if another command holds the lock, if it cannot be created, or if it
+    ``must_be_empty`` and is not.
     """
     if directory is None:
         yield

@@ -52,10 +52,8 @@ def _digest(document: Mapping[str, Any]) -> str:
 
 @contextlib.contextmanager
 def reading_file(path: Path, name: str = "") -> Iterator[None]:
-    """Turn every exception of a body that reads the file ``path`` into a DamagedError.
-
-    Raises DamagedError before the body runs if ``path`` is not a regular file. Messages begin with
-    ``name``.
+    """Turn exceptions of a body that reads ``path`` into a DamagedError, which names ``name``;
+    raises it before unless that is a regular file.
     """
     prefix = f"{name} " if name else ""
     try:
@@ -101,10 +99,8 @@ def file_digests(directory: Path, names: Iterable[str]) -> dict[str, str]:
 
 
 def check_files(directory: Path, manifest: Mapping[str, Any], names: Iterable[str] = ()) -> None:
-    """Raise DamagedError if a file in ``directory`` is missing or does not have the digest that the
-    ``manifest`` lists for it.
-
-    Checks those of ``names`` that the manifest lists; by default, all files that it lists.
+    """Raise DamagedError unless those of ``names`` (default: all) that the ``manifest`` lists have
+    its digests.
     """
     digests = manifest.get("files", {})
     require_form(digests, {}, "files")
@@ -129,11 +125,9 @@ TEXTS = "a list of texts"
 
 
 def require_form(value: Any, form: Any, key_path: str = "") -> None:
-    """Raise DamagedError unless a JSON value has a ``form``, a description of keys and types;
-    messages name its ``key_path``.
-
-    A form is NUMBER, COUNT, TEXT or TEXTS, a list [form of every item], or a dictionary {key: form
-    of its value}. Keys that end in ``?`` are optional, and other keys are allowed.
+    """Raise DamagedError at ``key_path`` unless a JSON value has a ``form``: NUMBER, COUNT, TEXT,
+    TEXTS, a list [form of items], or {key: form of value}; keys with ``?`` are optional, others
+    allowed.
     """
     named = "a table" if isinstance(form, dict) else "a list" if isinstance(form, list) else form
     if not (_FORMS[form](value) if named is form else isinstance(value, type(form))):

@@ -25,11 +25,8 @@ class InterruptedRunError(KeyboardInterrupt):
 def explain_failure(
     scenario: Scenario, error: BaseException, directory: Path | None = None
 ) -> BaseException:
-    """Return the exception to raise in place of ``error``.
-
-    It is an EngineError that names the user's class in which ``error`` was raised, an
-    InterruptedRunError for Ctrl-C during a run into ``directory``, or otherwise ``error`` itself.
-    ``directory`` is the run directory, whose manifest has the traceback, or None.
+    """Return the exception to raise in place of ``error``: an EngineError that names the user's
+    class in which it was raised, an InterruptedRunError for Ctrl-C in ``directory``, or itself.
     """
     if isinstance(error, KeyboardInterrupt) and directory is not None:
         return InterruptedRunError(directory)
@@ -44,9 +41,7 @@ def explain_failure(
 
 @contextmanager
 def explain_failures(scenario: Scenario) -> Iterator[None]:
-    """Replace an exception of a user's class in the body by an EngineError that names the class;
-    others pass unchanged.
-    """
+    """Turn exceptions of a user's class in the body into an EngineError that names it."""
     try:
         yield
     except Exception as error:

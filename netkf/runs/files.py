@@ -27,10 +27,8 @@ from netkf.trace.run import Run
 
 @contextlib.contextmanager
 def writing_file(path: Path) -> Iterator[None]:
-    """Turn every OSError of the body into a WriteError about ``path``.
-
-    Raises WriteError before the body runs if ``path`` has a NUL character or no file name, or is a
-    device, a pipe, a socket or a link.
+    """Turn OSErrors of the body into a WriteError about ``path``; raises it before for a path
+    without a name or with NUL, a device, a pipe, a socket or a link.
     """
     if "\0" in str(path):
         raise WriteError(OSError(errno.EINVAL, ""), path)
@@ -55,9 +53,7 @@ _FOREIGN_KINDS = {
 
 
 def require_own(path: Path) -> None:
-    """Raise WriteError if ``path`` is a device, a pipe, a socket or a link: files are renamed to
-    their paths when they are complete, which would take its place, for root even that of /dev/null.
-    """
+    """Raise WriteError for a device, pipe, socket or link, which a renamed file would replace."""
     try:
         kind = _FOREIGN_KINDS.get(stat.S_IFMT(os.lstat(path).st_mode))
     except (OSError, ValueError):  # there is none, or there can be none
@@ -67,10 +63,7 @@ def require_own(path: Path) -> None:
 
 
 def publish(temporary: Path, path: Path) -> None:
-    """Flush a finished ``temporary`` file to disk and rename it to ``path``; raises OSError.
-
-    After a power failure ``path`` is the complete file, or is as it was before.
-    """
+    """Flush a ``temporary`` file to disk and rename it to ``path``; raises OSError."""
     with temporary.open("rb+") as file:
         os.fsync(file.fileno())
     os.replace(temporary, path)
@@ -84,11 +77,8 @@ def publish(temporary: Path, path: Path) -> None:
 
 @contextlib.contextmanager
 def write_atomically(path: Path, writer: str = "") -> Iterator[Path]:
-    """Yield the path of a temporary file that replaces ``path`` at the end of the body.
-
-    Processes that may write the file at the same time each give a name as ``writer``. Readers never
-    see an incomplete file; if the body raises, the temporary file is removed. Raises WriteError if
-    the body raises OSError or the file cannot be renamed.
+    """Yield a temporary path that replaces ``path`` after the body, or is removed if that raises; a
+    ``writer`` is the name of one of several processes. Raises WriteError.
     """
     temporary = path.parent / f"{path.name}.{writer}part"
     # Before the block that removes it: what is not a file here is nobody's temporary file.
@@ -115,12 +105,8 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def json_text(value: Any, margin: str = "\n") -> str:
-    """Return a value as indented JSON text, that of ``json.dumps(to_json_value(value), indent=2)``,
-    computed faster.
-
-    ``margin`` is the line break and the indentation of the line that the value begins on. The
-    standard library indents in plain Python, with a call for each number; here each dictionary or
-    list of scalars, such as the row of a node, takes one call of its compiled encoder.
+    """Return ``json.dumps(to_json_value(value), indent=2)`` after a ``margin``, faster: each
+    dictionary or list of scalars takes one call of the compiled encoder.
     """
     if not isinstance(value, (dict, list, tuple)) or not value:
         return json.dumps(to_json_value(value))
@@ -138,9 +124,7 @@ def json_text(value: Any, margin: str = "\n") -> str:
 
 
 def to_json_value(value: Any) -> Any:
-    """Return a value with numpy numbers as Python numbers, tuples as lists, and None in place of
-    floats that are not finite, which JSON excludes.
-    """
+    """Return a value for JSON: Python numbers, lists, and None for floats that are not finite."""
     if isinstance(value, (float, np.floating)):
         return float(value) if math.isfinite(value) else None
     if isinstance(value, dict):
@@ -151,10 +135,7 @@ def to_json_value(value: Any) -> Any:
 
 
 def create_output_directory(requested: Path | None, name: str) -> Path:
-    """Create and return a directory for results: ``requested``, or the first free runs/NAME-k.
-
-    Raises ScenarioError if ``requested`` cannot be created or is not empty.
-    """
+    """Return a directory for results: ``requested``, if empty (ScenarioError), or runs/NAME-k."""
     if requested is None:
         safe = "".join(c if c.isalnum() or c in "-_." else "-" for c in name)[:100].strip(".")
         paths = (Path("runs") / f"{safe or 'run'}-{k}" for k in range(1, 1_000_000))
@@ -172,10 +153,8 @@ def create_output_directory(requested: Path | None, name: str) -> Path:
 
 
 def make_directory(path: Path, must_be_new: bool = False) -> bool:
-    """Create a directory unless it exists, check that it can be read, and return True.
-
-    Return False instead if it ``must_be_new`` and exists already. Raises ScenarioError if it cannot
-    be created or read.
+    """Create a directory unless it exists, and return True; False if it ``must_be_new`` and exists.
+    Raises ScenarioError if it cannot be created or read.
     """
     try:
         path.mkdir(parents=True, exist_ok=not must_be_new)
@@ -201,9 +180,7 @@ def require_run(run: object) -> Scenario:
 
 
 def output_file(out: str | Path, name: str) -> Path:
-    """Return the path of a file to write: ``out``, or ``name`` in it if it is a folder, which must
-    not exist yet. Raises ScenarioError and WriteError.
-    """
+    """Return the file to write, ``out`` or in that folder ``name``, which must be new."""
     path = as_path("out", out)
     path = path / name if path.is_dir() else path
     require_own(path)
@@ -239,9 +216,8 @@ def copied_file_names(scenario: Scenario) -> list[str]:
 
 
 def holds_only(directory: Path, names: Collection[str]) -> bool:
-    """Return True if a directory holds nothing but files of these ``names`` (paths relative to it),
-    their temporary files (NAME.part) and stored blocks of an ensemble, so that clearing it loses
-    nothing of the user's.
+    """Return True if a directory holds nothing but ``names``, their temporary files and stored
+    blocks, so that clearing it loses nothing of the user's.
     """
     allowed = {*names, *(f"{name}.part" for name in names), BLOCKS_FOLDER}
     allowed |= {str(folder) for name in names for folder in Path(name).parents}
@@ -256,9 +232,7 @@ def file_digest(path: Path) -> str:
 
 
 def remove_files(directory: Path, names: Iterable[str]) -> None:
-    """Remove the files of these ``names`` (relative paths), their temporary files (NAME.part) and
-    the folders that this leaves empty from a directory.
-    """
+    """Remove files of these ``names``, their temporary files, and folders left empty."""
     for name in names:
         for file in (directory / name, directory / f"{name}.part"):
             file.unlink(missing_ok=True)
@@ -268,11 +242,8 @@ def remove_files(directory: Path, names: Iterable[str]) -> None:
 
 
 def check_sources(scenario: Scenario) -> None:
-    """Raise ScenarioError if a run directory could not hold a copy of the scenario, from which the
-    run could be repeated; called before anything is simulated.
-
-    That is if a class is defined where scenario.toml cannot import it from, or if a file that the
-    scenario names has the name of a file that netkf writes.
+    """Raise ScenarioError if a class is defined where scenario.toml cannot import it from, or if a
+    file that the scenario names has the name of one that netkf writes.
     """
     name = find_unimportable_class(scenario, in_script=False)
     if name is not None:
@@ -288,11 +259,8 @@ def check_sources(scenario: Scenario) -> None:
 def write_scenario(
     directory: Path, scenario: Scenario, seed: int | None = None, resolve: bool = True
 ) -> None:
-    """Write scenario.toml with all defaults filled in, unless they should not be ``resolve``-d
-    because keys may still change, and copy the files and modules that it names.
-
-    ``seed`` replaces the root seed of the scenario, so that the copy reproduces the run. Raises
-    WriteError.
+    """Write scenario.toml, ``resolve`` with all defaults and with ``seed``, and copy its files and
+    modules. Raises WriteError.
     """
     for source in source_files(scenario):
         _copy(source.full, directory / source.name)
@@ -315,9 +283,7 @@ def _copy(source: Path, target: Path) -> None:
 
 
 def scenario_digest(scenario: Scenario) -> str:
-    """Return the SHA-256, in hexadecimal, of a scenario with all defaults filled in, together with
-    the files and modules that it names, by which resumed commands know their own results.
-    """
+    """Return the SHA-256 of a scenario with all defaults and its files, to know own results."""
     digest = hashlib.sha256(to_toml(resolve_defaults(scenario)).encode())
     files = {source.name: source.full for source in source_files(scenario)}
     files |= {f"{name}.py": file for name, file in find_module_files(scenario).items() if file}
@@ -327,9 +293,7 @@ def scenario_digest(scenario: Scenario) -> str:
 
 
 def missing_modules(scenario: Scenario) -> list[str]:
-    """Return a sentence about each Python module that a run needs but that cannot be copied to its
-    directory.
-    """
+    """Return a sentence about each module of a run that cannot be copied to its directory."""
     return [
         f"the run directory needs the Python module {name}, which was not copied into it: it is no "
         "single file beside the scenario"

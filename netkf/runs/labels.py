@@ -9,9 +9,7 @@ from netkf.scenario.scenario import Scenario
 
 
 def covariance_bias(scenario: Scenario) -> str:
-    """Return "larger" or "smaller" if P is larger or smaller than the covariance of the error by
-    the design of the filter; empty if neither is known.
-    """
+    """Return "larger" or "smaller" as P is to the covariance of errors by design, or empty."""
     algorithm = scenario.filter.algorithm
     in_slots, in_continuous_time = scenario.node_filter.analysis.P_by_design
     design = in_slots if scenario.slotted else in_continuous_time
@@ -29,9 +27,7 @@ def covariance_notes(scenario: Scenario) -> tuple[str, ...]:
 
 
 def nees_note(scenario: Scenario) -> str:
-    """Return a note for users on NEES if P differs from the covariance of the error by design; else
-    an empty text.
-    """
+    """Return a note on NEES if P differs from the covariance of errors by design, or empty."""
     sizes, design = np.unique(scenario.sizes).tolist(), covariance_bias(scenario)
     n = f"{sizes[0]}" if len(sizes) == 1 else f"{sizes[0]} .. {sizes[-1]}"
     if design == "smaller":
@@ -49,9 +45,7 @@ def nees_note(scenario: Scenario) -> str:
 
 
 def mismatch_note(scenario: Scenario) -> str:
-    """Return a note for users on P and its bound if the filters' model may differ from the truth;
-    else an empty text.
-    """
+    """Return a note on P and its bound if the filters' model may not be the truth, or empty."""
     if scenario.departures:
         return "; ".join(evidence for _, evidence in scenario.departures)
     if not scenario.is_linear:

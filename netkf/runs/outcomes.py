@@ -69,9 +69,7 @@ def outcomes_of(messages: np.ndarray, nodes: Sequence[int]) -> Outcomes:
 
 
 def delivery_matrix(outcomes: Outcomes, size: int) -> FloatArray:
-    """Return the share of messages from node i to node j of N = ``size`` that were heard, (N, N),
-    nan where none was sent.
-    """
+    """Return the share heard of messages from i to j, (N, N), nan where none was sent."""
     code = outcomes.sender * size + outcomes.receiver
     sent, heard = (
         np.bincount(code, weights, size * size).reshape(size, size)
@@ -82,10 +80,8 @@ def delivery_matrix(outcomes: Outcomes, size: int) -> FloatArray:
 
 
 def fate_matrix(outcomes: Outcomes, size: int) -> FloatArray:
-    """Return the correlation of the outcomes of hearers i and j of the same broadcasts, (N, N), nan
-    where they have none or one of them heard all, or nothing, and for i = j.
-
-    Outcomes are taken about the mean of their link, and pooled over the senders.
+    """Return the correlation of outcomes of hearers i and j of a broadcast, (N, N), about the means
+    of links; nan on the diagonal and where unknown.
     """
     mean = delivery_matrix(outcomes, size)
     gap = outcomes.heard - mean[outcomes.sender, outcomes.receiver]
@@ -112,9 +108,8 @@ def fate_matrix(outcomes: Outcomes, size: int) -> FloatArray:
 def loss_windows(
     outcomes: Outcomes, size: int, edges: FloatArray
 ) -> tuple[list[tuple[int, int]], FloatArray]:
-    """Return the directed links (indices of sender and receiver) that sent anything, and for each
-    the share lost of what was sent between neighbouring ``edges`` (B + 1,) in seconds, (L, B), nan
-    where nothing was.
+    """Return the links (indices) that sent, and the share lost between ``edges`` (B + 1,) in
+    seconds, (L, B), nan where nothing was sent.
     """
     codes, link = np.unique(outcomes.sender * size + outcomes.receiver, return_inverse=True)
     bins = np.clip(np.searchsorted(edges, outcomes.sent, side="right") - 1, 0, len(edges) - 2)

@@ -40,12 +40,8 @@ the time of dictionaries for all.
 def read_numbers(
     path: Path, columns: Sequence[str], run: int | None = None, allow_empty: bool = False
 ) -> pd.DataFrame:
-    """Return numeric columns of a Parquet file, only the rows of one ``run`` unless that is None.
-
-    With ``allow_empty`` empty cells of floats become nan.
-
-    Raises DamagedError if the file cannot be read, lacks one of the columns, has more than
-    MAX_READ_ROWS rows, or has empty cells that are not allowed.
+    """Return numeric columns of a Parquet file, of one ``run`` or all, with ``allow_empty`` nan for
+    empty cells. Raises DamagedError, also above MAX_READ_ROWS rows.
     """
     import pandas as pd
 
@@ -65,11 +61,7 @@ def read_numbers(
 
 
 def read_texts(path: Path, column: str, run: int | None = None) -> pd.Series[str]:
-    """Return a text column of a Parquet file as a categorical series, only the rows of one ``run``
-    unless that is None.
-
-    Raises DamagedError if the file cannot be read, lacks the column or has empty cells in it.
-    """
+    """Return a text column, of one ``run`` or all, as a categorical series; raises DamagedError."""
     import pandas as pd
 
     with _open_for_reading(path) as source, pq.ParquetFile(source) as file:
@@ -84,10 +76,7 @@ def read_texts(path: Path, column: str, run: int | None = None) -> pd.Series[str
 
 
 def read_flags(path: Path, column: str) -> np.ndarray:
-    """Return a column of booleans of a Parquet file as an array (rows,).
-
-    Raises DamagedError if the file cannot be read, lacks the column or has empty cells in it.
-    """
+    """Return a column of booleans (rows,); raises DamagedError, also for empty cells."""
     with _open_for_reading(path) as source, pq.ParquetFile(source) as file:
         types_by_name = dict(zip(file.schema_arrow.names, file.schema_arrow.types, strict=True))
         if not pa.types.is_boolean(types_by_name.get(column, pa.null())):
@@ -130,9 +119,7 @@ def column_names(path: Path) -> list[str]:
 
 
 def is_numeric_column(path: Path, name: str) -> bool:
-    """Return True if the column ``name`` of a Parquet file holds numbers; raises DamagedError if
-    the file cannot be read.
-    """
+    """Return True if a column of a Parquet file holds numbers; raises DamagedError."""
     with _open_for_reading(path) as source:
         return _is_numeric(pq.read_schema(source).field(name).type)
 
@@ -201,10 +188,7 @@ class ParquetSink(Sink):
         self._states.flush()
 
     def close(self) -> None:
-        """Write what is left, finish the files and rename them from NAME.part; raises WriteError.
-
-        Without samples there is no states.parquet.
-        """
+        """Finish the files and rename them from NAME.part; raises WriteError."""
         # All callbacks run, the last one first: if the disk is full when the last samples are
         # written, the table of events is finished nevertheless.
         with contextlib.ExitStack() as callbacks:
@@ -227,10 +211,7 @@ class ParquetSink(Sink):
 
 
 def _arrow(values: Any) -> Any:
-    """Return a column (rows,) as an Arrow array; nan is null.
-
-    ``pyarrow.array`` imports pandas, which takes as long as a short run does.
-    """
+    """Return a column as an Arrow array, nan is null; ``pyarrow.array`` would import pandas."""
     if not isinstance(values, np.ndarray) or values.dtype.kind not in "iuf":
         return pa.array(values, from_pandas=True)
     valid = None

@@ -27,10 +27,7 @@ UNRELATED_VARIABLES = ("NUMBA_CACHE_DIR", "NUMBA_NUM_THREADS", "NUMBA_DEBUG_CACH
 
 
 def versions() -> dict[str, str]:
-    """Return the version of each package that the last bits of results depend on, by name.
-
-    ``source`` is the digest of netkf's own files, which may change without a new version.
-    """
+    """Return versions of packages that last bits depend on; ``source`` is netkf's own digest."""
     return dict(_cached_versions())
 
 
@@ -51,10 +48,8 @@ def _cached_versions() -> dict[str, str]:
 
 @cache
 def machine() -> dict[str, Any]:
-    """Return properties of the computer by which libraries choose their code, and so its rounding.
-
-    ``architecture`` and ``system``; ``processor`` and ``features`` (a digest), for which numba
-    compiles; ``vector_instructions`` that numpy uses; ``environment`` variables, if any are set.
+    """Return what libraries choose their code by, and so its rounding: ``architecture``,
+    ``system``, ``processor``, ``features``, ``vector_instructions`` and ``environment`` variables.
     """
     result: dict[str, Any] = {"architecture": platform.machine(), "system": platform.system()}
     try:
@@ -75,9 +70,7 @@ def machine() -> dict[str, Any]:
 
 
 def installation_digest() -> str:
-    """Return the SHA-256, in hexadecimal, of the software and hardware that the last bits of
-    results depend on.
-    """
+    """Return the SHA-256 of the software and hardware that last bits depend on."""
     text = json.dumps([versions(), machine()], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 

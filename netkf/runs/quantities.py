@@ -57,9 +57,8 @@ def with_network(scenario: Scenario) -> Scenario:
 
 
 def sample_quantities(scenario: Scenario, squares: FloatArray) -> FloatArray:
-    """Return quantities (..., N + 1, K) of ``sample_names`` for each node and all nodes together.
-
-    ``squares`` (..., T, N) are squared errors, or traces of P, at T samples; T may be 0.
+    """Return ``sample_names`` (..., N + 1, K) of nodes and of all, from squared errors or traces
+    (..., T, N) of T samples; T may be 0.
     """
     metrics, (*runs, count, nodes) = scenario.metrics, squares.shape
     found = np.full((*runs, nodes + 1, len(sample_names(scenario))), np.nan)
@@ -124,8 +123,8 @@ class NetworkSink(Sink):
         self.connectivity.states(t, x, xhat, P, error)
 
     def values(self, complete: bool) -> FloatArray:
-        """Return the quantities NETWORK (N + 1, 6) of each node and of all, nan where they do not
-        exist; a run that is not ``complete`` ends with its last event.
+        """Return NETWORK (N + 1, 6) of nodes and of all, nan if missing; unless ``complete`` a run
+        ends with its last event.
         """
         scenario = self._scenario
         found = np.full((len(scenario.nodes) + 1, len(NETWORK)), np.nan)
@@ -174,9 +173,7 @@ def _make_ages(scenario: Scenario) -> Ages | None:
 
 
 def _read_at(scenario: Scenario, nodes: np.ndarray, times: FloatArray) -> FloatArray:
-    """Return when the readings used at ``times`` (K,) were taken: in slots at the start of theirs,
-    nan where the tables of recorded sensors have none.
-    """
+    """Return when readings used at ``times`` (K,) were taken, nan where tables have none."""
     if not scenario.slotted:
         return times
     plant, found = scenario.slot_plant, np.array(times)
@@ -194,9 +191,7 @@ def _read_at(scenario: Scenario, nodes: np.ndarray, times: FloatArray) -> FloatA
 def quantity_rows(
     names: Sequence[str], values: FloatArray, error: FloatArray | None = None
 ) -> list[dict[str, float | None]]:
-    """Return ``values`` (N + 1, K) of ``names`` as rows of summary.json, None where they are
-    unknown, with their standard errors ``error``, if any.
-    """
+    """Return ``values`` (N + 1, K) of ``names`` as rows of summary.json, and ``error`` if any."""
     columns = [*names, *(f"{name}_se" for name in (() if error is None else names))]
     table = values if error is None else np.concatenate([values, error], axis=1)
     rows = (dict(zip(columns, row, strict=True)) for row in table.tolist())

@@ -61,9 +61,8 @@ def collect_readings(
     all_slots: bool = False,
     engine: str = "auto",
 ) -> Readings:
-    """Return what the ``placed`` sensors, by node id, read in a ``replica`` after time 0; the run
-    is ``simulated`` too, by an ``engine``, if readings are drawn. Raises ScenarioError and
-    EngineError.
+    """Return what the ``placed`` sensors read in a ``replica`` after time 0; ``simulated`` by an
+    ``engine`` too if readings are drawn. Raises ScenarioError and EngineError.
     """
     streams = Streams(seed, replica)
     numbers = {
@@ -115,9 +114,7 @@ def _readings_of(
     places: np.ndarray,
     states: FloatArray,
 ) -> Iterator[SensorReading]:
-    """Yield what a ``sensor`` of a node reads at its ``instants`` (K,), times or slots, where the
-    states are rows ``places`` (K,) of ``states``; there may be none of the last.
-    """
+    """Yield readings of a ``sensor`` at ``instants`` (K,), with states in rows ``places`` (K,)."""
     node, one = sensor
     path: Any = (scenario.slot_path if scenario.slotted else scenario.sample_path)(
         streams, node, one

@@ -83,13 +83,11 @@ def run_to_directory(
     finish: Callable[[CompletedRun], None] | None = None,
     replica: int = 0,
 ) -> CompletedRun:
-    """Simulate a scenario once, as ``replica`` of an ensemble, and write a run directory.
+    """Simulate ``replica`` of a scenario into ``out`` (None: the first free runs/NAME-k).
 
-    It holds scenario.toml, manifest.json, the Parquet tables and summary.json. ``out`` is the
-    directory (None: the first free runs/NAME-k). ``trace`` is "full", "first" (the same for a
-    single run) or "none" (no tables). ``finish`` may add files before the manifest says that the
-    run is complete. If the run is interrupted or fails, its results until then are written, and the
-    manifest says ``interrupted``, or ``failed`` with the error.
+    ``trace`` is "full", "first" (the same here) or "none" (no tables). ``finish`` may add files
+    before the manifest says that the run is complete; of an interrupted or failed run the results
+    until then are written, and the manifest says so.
 
     Raises ScenarioError and EngineError before anything is written, InterruptedRunError (a
     KeyboardInterrupt) when interrupted, and EngineError if a user's class fails.
@@ -310,10 +308,8 @@ class Manifest:
         error: BaseException | None = None,
         names: Iterable[str] = (),
     ) -> None:
-        """Write manifest.json; raises WriteError.
-
-        It has the status, the ``totals``, the number of completed runs, the ``error`` of a failed
-        run, the digests of the existing files among ``names``, and its own digest.
+        """Write manifest.json: status, ``totals``, completed runs, the ``error`` of a failed run,
+        and digests of files among ``names`` and of itself. Raises WriteError.
         """
         manifest: dict[str, Any] = {
             "name": self.name,

@@ -23,13 +23,9 @@ ENGINES = ("auto", "simpy", "compiled")
 def choose_engine(
     name_or_engine: str | Engine, scenario: Scenario, announce: bool = True
 ) -> Engine:
-    """Return the engine for a scenario, given by its name or as an Engine.
-
-    Names are ``simpy`` (or ``processes``), ``compiled``, and ``auto``: the compiled engine if it
-    can run the scenario and kernels are compiled, and SimPy otherwise. With ``announce`` an engine
-    that has to compile first, or cannot, prints so.
-
-    Raises EngineError if the name is unknown or the engine cannot run the scenario.
+    """Return the engine by name or itself: ``simpy`` (``processes``), ``compiled``, or ``auto``,
+    compiled if possible; with ``announce`` one that compiles first, or cannot, prints so. Raises
+    EngineError.
     """
     if isinstance(name_or_engine, Engine):
         engine: Engine = name_or_engine
@@ -56,9 +52,7 @@ def _simpy_engine() -> Engine:
 
 
 def require_scenario(value: object, function: str, rest: str = "") -> None:
-    """Raise ScenarioError unless ``value`` is a scenario; the remedy shows a call of ``function``
-    with the ``rest`` of its arguments.
-    """
+    """Raise ScenarioError unless ``value`` is a scenario; the remedy is a call of ``function``."""
     if not isinstance(value, Scenario):
         remedy = f"load it first: netkf.{function}(netkf.load(path){rest})"
         raise ScenarioError("", f"{function} takes a netkf.Scenario", value, remedy)
@@ -98,11 +92,7 @@ def collect_run(
     engine: str,
     status: str,
 ) -> Run:
-    """Return the Run of a finished simulation whose ``recorder`` wrote to ``memory``.
-
-    It is number ``replica`` of the runs of ``seed``; ``engine`` is the name of the engine,
-    ``status`` "complete" or "diverged".
-    """
+    """Return the Run of number ``replica`` of ``seed`` whose ``recorder`` wrote to ``memory``."""
     count, width = len(scenario.nodes), scenario.width
     shapes = (), (scenario.plant.n,), (count, width), (count, width, width), (count, width)
     # Concatenated with empty arrays, the arrays of a run without samples have the right shapes.

@@ -124,10 +124,8 @@ class StoredRun(WithPromises, Run):
 
 
 def read_checked_document(directory: Path, name: str, form: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the JSON document in the file ``name`` of a directory.
-
-    Raises DamagedError if it does not have the keys and types of ``form`` (see
-    documents.require_form), or if it has a seal, a digest of its other entries, that does not fit.
+    """Return the JSON document ``name`` of a directory; raises DamagedError without the keys and
+    types of ``form``, or if its seal (a digest of its other entries) does not fit.
     """
     with add_file_name(name):
         document = read_document(directory / name)
@@ -140,11 +138,8 @@ def read_checked_document(directory: Path, name: str, form: Mapping[str, Any]) -
 def read_run(
     directory: Path, scenario: Scenario, manifest: dict[str, Any], replica: int | None = None
 ) -> StoredRun:
-    """Return the run in a directory, or one ``replica`` of the ensemble there whose events and
-    samples were kept.
-
-    ``manifest`` has the keys and types of MANIFEST_FORM. Raises DamagedError if a file is not as
-    netkf writes it.
+    """Return the run in a directory, or one recorded ``replica`` of an ensemble; the ``manifest``
+    has MANIFEST_FORM. Raises DamagedError.
     """
     check_files(directory, manifest, [*TABLE_FILES, "summary.json"])
     summary = read_checked_document(directory, "summary.json", SUMMARY_FORM)

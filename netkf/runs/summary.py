@@ -109,12 +109,11 @@ class SampleIndices(NamedTuple):
 def select_averaged_samples(
     times: FloatArray, rounding_from: float, diverged: bool
 ) -> SampleIndices:
-    """Return the indices of those samples at ``times`` (T,) that the averages over time in a
-    summary are taken over.
+    """Return the samples of averages over time: those after time 0 (or all), without the last one
+    of a run that ``diverged``.
 
-    These are the samples after time 0 (all of them if none is later), without the last sample of a
-    run that ``diverged``. Errors from ``rounding_from`` on are left out because rounding dominates
-    them, and covariances at the same times if the run diverged, because they grow without bound.
+    Errors from ``rounding_from`` on are left out because rounding dominates them, and covariances
+    at the same times if the run diverged, because they grow without bound.
     """
     usable = times[: len(times) - 1] if diverged and len(times) > 1 else times
     after_start = usable > 0.0 if (usable > 0.0).any() else np.ones(len(usable), dtype=bool)
@@ -124,10 +123,8 @@ def select_averaged_samples(
 
 
 def chi_square_interval(freedom: Any, probability: float) -> tuple[FloatArray, FloatArray]:
-    """Return the lower and upper ends (M,) of intervals for chi-square variables divided by their
-    degrees of ``freedom`` (M,), or those of one interval for a number.
-
-    Each interval holds its variable with the given ``probability``; the tails are equally probable.
+    """Return the ends (M,) of intervals of chi-square variables over their ``freedom`` (M,), each
+    with the given ``probability`` and equal tails.
     """
     tail = 0.5 * (1.0 - probability)
     low, high = (
@@ -137,11 +134,7 @@ def chi_square_interval(freedom: Any, probability: float) -> tuple[FloatArray, F
 
 
 def nees_bounds(n: int, runs: int = 1, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Return the ends of the interval that holds the mean NEES of one sample over ``runs`` runs
-    with probability ``confidence`` if P is exact.
-
-    The sum over the runs is chi-square with ``runs n`` degrees of freedom, n states.
-    """
+    """Return the ends of the interval of the mean NEES of a sample over ``runs`` if P is exact."""
     low, high = chi_square_interval(runs * n, confidence)
     return n * float(low), n * float(high)
 
@@ -173,9 +166,7 @@ class PromisedTraces:
 
 
 def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
-    """Return the traces that theory gives to compare those of P with at the sample ``times`` (T,),
-    see ``theory.traces``; none of them without the theory wing.
-    """
+    """Return the traces of theory at the samples; none of them without the theory wing."""
     try:
         promised: PromisedTraces = WINGS.promise_traces(scenario, times)
     except ModuleNotFoundError as error:
@@ -194,14 +185,9 @@ def summarise(
     messages: dict[str, int],
     network: FloatArray | None = None,
 ) -> dict[str, Any]:
-    """Return the summary of a run, as in summary.json.
-
-    ``nodes`` and ``overall`` have averages over time, see :func:`select_averaged_samples`: the RMS
-    error, the mean trace of P, the mean bound and the ratio of both, and the mean NEES, and the
-    quantities of ``runs.quantities`` over the same samples, with those of the ``network``
-    (N + 1, 6), if they are known; ``nodes`` also the numbers of messages and transmissions of each
-    node. ``messages`` are the numbers of messages ``sent``, ``delivered`` and ``lost`` in the
-    network. Averages are nan if there is no sample or no covariance.
+    """Return the summary of a run, as in summary.json: averages over time of nodes and of all,
+    quantities of samples and of the ``network`` (N + 1, 6), and numbers of ``messages``, nan if
+    unknown.
     """
     rows = _average_rows(scenario, sink, promised)
     if network is not None:
@@ -267,10 +253,8 @@ def node_rows(
     bound: FloatArray | None,
     error: FloatArray | None = None,
 ) -> list[dict[str, Any]]:
-    """Return N + 1 rows of summary.json: of each node, and of all together.
-
-    ``mean`` (N + 1, 3) are the mean square error, mean trace of P and mean NEES, ``error`` their
-    standard errors, if any, and ``bound`` (N + 1,) the mean bound on the trace, if any.
+    """Return N + 1 rows of summary.json, of nodes and of all: ``mean`` (N + 1, 3) of square error,
+    trace of P and NEES, standard errors ``error``, and the mean ``bound`` (N + 1,), if any.
     """
     with np.errstate(all="ignore"):  # ratios to a bound of 0
         rms = np.sqrt(mean[:, 0])
@@ -301,11 +285,7 @@ def _mean_or_nan(values: list[FloatArray], indices: np.ndarray, scenario: Scenar
 def summary_notes(
     scenario: Scenario, rounding_from: float | None, has_covariance: bool
 ) -> list[str]:
-    """Return notes for users on the averages of a run or of an ensemble, one sentence each.
-
-    ``rounding_from`` is the time in seconds from which rounding blurs errors, if any;
-    ``has_covariance`` says whether the filter gives P.
-    """
+    """Return notes on averages: rounding from a time (s) on, and whether the filter gives P."""
     notes = [] if has_covariance else [NO_COVARIANCE]
     if rounding_from is not None and scenario.plant.truth_known:
         notes.append(
@@ -324,11 +304,8 @@ def _clipping_notes(scenario: Scenario, clipped: int) -> list[str]:
 
 
 def conserved_sums(sums: dict[str, tuple[float, float]]) -> dict[str, Any]:
-    """Return the entry of summary.json on sums over all nodes that exchanges should conserve, such
-    as the masses of push-sum.
-
-    ``sums`` has (exact value, total at the last sample) by name; the entry adds the relative
-    deviation of the total, ``drift``.
+    """Return the entry of summary.json on conserved sums, from (exact, last) by name, with the
+    relative deviation ``drift``.
     """
     return {
         name: {"exact": exact, "total": total, "drift": (total - exact) / exact}

@@ -43,10 +43,7 @@ def format_with_error(value: float | None, error: float | None) -> str:
 
 
 def format_table(header: list[str], rows: list[list[str]], left_columns: int = 0) -> str:
-    """Return a table as text, the first ``left_columns`` aligned left and the others right.
-
-    Cells may hold text from files: line breaks and control characters in them are escaped.
-    """
+    """Return a table as text, ``left_columns`` aligned left; control characters are escaped."""
     rows = [[one_line(cell) for cell in row] for row in [header, *rows]]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = []
@@ -60,9 +57,7 @@ def format_table(header: list[str], rows: list[list[str]], left_columns: int = 0
 
 
 def shorten_rows(rows: list[list[str]], max_rows: int) -> list[list[str]]:
-    """Return the first and the last of more than ``max_rows`` rows, with a row between them that
-    says how many were omitted; return fewer rows unchanged.
-    """
+    """Return the first and last of more than ``max_rows`` rows, and how many were omitted."""
     if len(rows) <= max_rows:
         return rows
     omitted = [f"({len(rows) - max_rows} more)", *[""] * (len(rows[0]) - 1)]
@@ -76,12 +71,8 @@ def summary_table(
     unit: str = "",
     states: str = "",
 ) -> str:
-    """Return the table that `netkf run` prints, from the contents of summary.json.
-
-    It has a row for each node (the best and the worst of large networks) and one for all nodes,
-    followed by ``notes``, the limits to compare traces with (``limit`` is the name of the first,
-    empty if no bound is known for any network with this filter), NEES and messages. Columns name
-    the ``unit`` of all states; ``states`` is a line with their names.
+    """Return the table that ``netkf run`` prints of a summary: nodes, all, ``notes``, limits
+    (``limit`` names the first, if any), NEES and messages, with ``unit`` and names of ``states``.
     """
     lines = [*_node_table(summary, unit), *([states] if states else [])]
     if limit and not has_bound(summary):
@@ -129,9 +120,7 @@ def has_bound(summary: dict[str, Any]) -> bool:
 
 
 def columns_of(summary: dict[str, Any], unit: str = "") -> dict[str, str]:
-    """Return the headers of the columns of averages that a table of this summary has, by key, with
-    the ``unit`` of all states.
-    """
+    """Return the headers of columns of averages by key, with the ``unit`` of all states."""
     left_out = () if has_bound(summary) else BOUND_COLUMNS
     return {
         key: header + in_unit(unit, POWERS.get(key, 0), ", ")

@@ -85,11 +85,8 @@ def test_the_mean_covariance_stays_below_the_bound():
 
 
 def write_template(name: str, folder: Path) -> tuple[Path, Path]:
-    """Write a first scenario, NAME.toml, and tests of it, test_NAME.py, into a folder and return
-    their paths.
-
-    Raises ScenarioError if the name is invalid or one of the files exists. If writing fails,
-    removes both and raises WriteError.
+    """Write NAME.toml and test_NAME.py into a folder and return their paths; raises ScenarioError
+    for a wrong name or an existing file, and WriteError after removing both.
     """
     if not NAME_PATTERN.fullmatch(name):
         rule = "must be a letter, then letters, digits, - and _"

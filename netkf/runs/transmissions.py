@@ -38,9 +38,7 @@ class Transmissions:
         self._phases: set[int] = set()
 
     def add(self, rows: np.ndarray) -> None:
-        """Count the next block ``rows`` (E,) of EVENT rows; blocks must come in the order of the
-        run.
-        """
+        """Count the next block ``rows`` (E,) of EVENT rows, in the order of the run."""
         is_send = rows["kind"] == SEND
         node, t, phase = (rows[name][is_send] for name in ("node", "t", "phase"))
         for sender, count in zip(
@@ -117,9 +115,7 @@ class SentPerLink(Sink):
 
 
 def count_pairs(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the P distinct pairs of ``first`` and ``second`` (K,), sorted, and how often each
-    occurs: three arrays (P,).
-    """
+    """Return the P distinct pairs of ``first`` and ``second``, sorted, and their counts (P,)."""
     if not len(first):
         return first, second, first
     (least, low), span = (first.min(), second.min()), int(np.ptp(second)) + 1

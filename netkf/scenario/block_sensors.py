@@ -35,10 +35,8 @@ def require_no_blocks(sensors: Sequence[Any]) -> None:
 def stacked_sensors(
     sensors: Sequence[Any], layout: Layout, topology: Topology
 ) -> tuple[tuple[Any, ...], tuple[int, ...]]:
-    """Return the sensors of the stacked state that stand for ``sensors``, and the index of the
-    entry that each comes from.
-
-    Raises ScenarioError for a block that a node does not have, and for shapes that do not fit.
+    """Return the sensors of the stacked state, and the index of the entry that each comes from;
+    raises ScenarioError for a block that a node does not have, and for shapes that do not fit.
     """
     stacked, entries = [], []
     for k, sensor in enumerate(sensors):
@@ -68,10 +66,7 @@ def support_of(sensor: Any, n: int) -> np.ndarray:
 def estimated_blocks(
     estimates: str | tuple[str, ...], layout: Layout, topology: Topology
 ) -> tuple[tuple[Place, ...], ...]:
-    """Return the blocks that each node estimates, in the order of nodes, for ``filter.estimates``.
-
-    Raises ScenarioError for a node without any.
-    """
+    """Return the blocks that each node estimates; raises ScenarioError for a node without any."""
     blocks = []
     for node in topology.nodes:
         if estimates == "all":

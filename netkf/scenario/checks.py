@@ -54,10 +54,7 @@ MAX_GROWTH = 1e7  # exponent g of growth by e^g; a run needs a new frame each ti
 
 
 def check_scenario(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if the components of a scenario do not fit together or exceed limits.
-
-    The order matters: later checks rely on what earlier ones found correct.
-    """
+    """Raise ScenarioError if components do not fit together; later checks rely on earlier ones."""
     _check_times(scenario)
     _check_plant(scenario)
     _check_sensors(scenario)
@@ -232,9 +229,7 @@ def _list_ids(nodes: tuple[int, ...]) -> str:
 
 
 def _check_owners(scenario: DerivedScenario, name: str, entries: Sequence[Any]) -> None:
-    """Raise ScenarioError unless nodes are in one each of the ``entries`` of ``network.name``, and
-    their sensors take samples.
-    """
+    """Raise ScenarioError unless nodes are in one each of ``entries``, and take samples."""
     owners: dict[int, int] = {}
     for k, entry in enumerate(entries):
         for node in entry.nodes:

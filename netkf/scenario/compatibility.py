@@ -15,9 +15,7 @@ SAMPLING = 'sampling = { kind = "periodic", period = ... }'
 
 
 def filter_name(scenario: DerivedScenario) -> str:
-    """Return what messages call the filter of a scenario: its kind, and that of the one that it
-    wraps.
-    """
+    """Return what messages call the filter: its kind, and that of the one that it wraps."""
     algorithm = scenario.filter.algorithm
     filters = [kind_name(part) for part in walk(algorithm) if isinstance(part, Filter)]
     return " around ".join([f"{filters[0]} filter", *filters[1:]])
@@ -43,10 +41,7 @@ def check_time(scenario: DerivedScenario) -> None:
 
 
 def check_activation(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError unless the clocks suit the filter, the graph and the sensors.
-
-    Does nothing in slots or for filters that exchange no messages.
-    """
+    """Raise ScenarioError unless clocks suit filter, graph and sensors; not in slots."""
     clock, topology = scenario.network.activation, scenario.topology
     node_filter = scenario.node_filter
     if not isinstance(clock, LinkClock) or not node_filter.timing.talks:

@@ -73,18 +73,14 @@ class DerivedScenario(ScenarioModel):
 
     @property
     def slot_belief(self) -> tuple[FloatArray, FloatArray]:
-        """The matrices ``F`` and ``Q`` (n, n) that the filters use in slots; raises TheoryError if
-        the plant changes.
-        """
+        """``F`` and ``Q`` (n, n) of filters in slots; TheoryError if the plant changes."""
         _ = self.linear_plant
         self._require_one_piece()
         return self.believed_pieces[0]
 
     @property
     def belief(self) -> tuple[FloatArray, FloatArray]:
-        """The matrices ``A`` and ``Q = B B'`` (n, n) that the filters use in continuous time;
-        raises TheoryError if the plant changes.
-        """
+        """``A`` and ``Q = B B'`` (n, n) of filters; TheoryError if the plant changes."""
         _ = self.diffusion
         self._require_one_piece()
         return self.believed_pieces[0]
@@ -98,14 +94,12 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def last_piece(self) -> Self:
-        """The scenario with the plant after all its changes, and filters that believe then what
-        its own do; itself if the plant does not change.
-        """
+        """The scenario with the plant after all its changes, and what filters believe then."""
         return self.piece(len(self.plant.changes)) if len(self.plant.changes) else self
 
     def piece(self, number: int, cov: tuple[FloatArray, ...] | None = None) -> Self:
-        """Return this scenario with a plant that is always as in one of its pieces, by number, and
-        filters that believe then what these do; they start with ``cov``, (n, n) of each node.
+        """Return this scenario with a plant that is always as in one piece, and what filters
+        believe then; they start with ``cov``, (n, n) of each node.
         """
         names = "FQ" if self.slotted else "AB"
         plants: Any = self.plant.pieces
@@ -137,17 +131,14 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def followed_changes(self) -> FloatArray:
-        """(C,) times in seconds, below the horizon, of the changes of the plant that filters
-        follow.
-        """
+        """Times (C,) in seconds, below the horizon, of changes that filters follow."""
         changes = self.plant.changes
         return changes[changes < self.horizon] if self.filter.model.schedule else changes[:0]
 
     @cached_property
     def believed_pieces(self) -> tuple[tuple[FloatArray, FloatArray], ...]:
-        """The matrices that the filters use at first, and after each of the ``followed_changes``:
-        F and Q in slots, A and Q = B B' in continuous time, all (n, n). F and A of a plant that is
-        not linear are nan.
+        """The filters' F and Q in slots, A and Q = B B' otherwise, all (n, n), at first and after
+        each of ``followed_changes``; F and A are nan if not linear.
         """
         model, plant = self.filter.model, self.plant
         pieces: Any = plant.pieces[: 1 + len(self.followed_changes)]
@@ -166,9 +157,7 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def model_pieces(self) -> tuple[tuple[Any, ...], ...]:
-        """The believed models of all nodes, or that of a pooled filter, at first and after each of
-        the ``followed_changes``.
-        """
+        """The models of all nodes, or of a pooled filter, in each of ``believed_pieces``."""
         pooled, names = self.node_filter.timing.pooled, "FQ" if self.slotted else "AQ"
         first = (self._pooled_model,) if pooled else self._node_models
         pieces: list[tuple[Any, ...]] = [first]
@@ -194,9 +183,7 @@ class DerivedScenario(ScenarioModel):
         return tuple(pieces)
 
     def model_of(self, entity: int) -> Any:
-        """Return the believed model of the node with this index, 0 for a pooled filter: of one run
-        where it changes.
-        """
+        """Return the model of a node by index, 0 for a pooled filter; of a run if it changes."""
         changes = self.followed_slots if self.slotted else self.followed_changes.tolist()
         return changing_models([(models[entity],) for models in self.model_pieces], changes)[0]
 
@@ -208,18 +195,16 @@ class DerivedScenario(ScenarioModel):
 
     @property
     def model_slots(self) -> tuple[int, ...]:
-        """The slots (C,) from which on filters believe the matrices of the next piece: that of a
-        change, or the one after it where slots begin with the prediction from the slot before.
+        """The slots (C,) from which on filters believe the next piece: that of a change, or the one
+        after it where slots begin with the prediction.
         """
         later = not self.node_filter.timing.predicts
         return tuple(slot + later for slot in self.followed_slots)
 
     @property
     def slot_models(self) -> tuple[SlotModel, ...]:
-        """The believed model of each node in slots, in the order of ``nodes``: F, Q, and H and R of
-        its sensors together; raises TheoryError if the plant changes.
-
-        A random H is that of slot 0.
+        """The models of nodes in slots: F, Q, and H (of slot 0) and R of all sensors together;
+        raises TheoryError if the plant changes.
         """
         self._require_one_piece()
         _ = self.slot_plant
@@ -227,9 +212,7 @@ class DerivedScenario(ScenarioModel):
 
     @property
     def models(self) -> tuple[FlowModel, ...]:
-        """The believed model of each node in continuous time; equal models are one object. Raises
-        TheoryError if the plant changes.
-        """
+        """The models of nodes in continuous time; TheoryError if the plant changes."""
         self._require_one_piece()
         _ = self.diffusion
         return self._node_models
@@ -251,9 +234,7 @@ class DerivedScenario(ScenarioModel):
 
     @property
     def pooled_slot_model(self) -> SlotModel:
-        """The believed model of a central filter, which reads the sensors of all nodes, in slots;
-        raises TheoryError if the plant changes.
-        """
+        """The model of a central filter in slots; raises TheoryError if the plant changes."""
         self._require_one_piece()
         _ = self.slot_plant
         pooled: SlotModel = self._pooled_model
@@ -276,9 +257,8 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def common_entries(self) -> dict[Link, tuple[np.ndarray, np.ndarray]]:
-        """The entries (k,) that both ends of a link (sender, receiver) estimate, in the state of
-        the sender and in that of the receiver, where the two estimate different states. Empty for
-        filters whose messages say of which blocks they speak.
+        """The entries (k,) that both ends of a link estimate, in the state of either, where these
+        differ; empty for filters whose messages say of which blocks they speak.
         """
         if self.views is None or self.node_filter.needs.blocks or self.node_filter.timing.pooled:
             return {}
@@ -292,9 +272,7 @@ class DerivedScenario(ScenarioModel):
     def _own_sensors(
         self, k: int, placed: tuple[PlacedSensor, ...]
     ) -> tuple[FloatArray, FloatArray]:
-        """Return H (p, n') and R (p, p) of those sensors of node ``k`` that read what it estimates
-        and nothing else.
-        """
+        """Return H (p, n') and R (p, p) of sensors of node ``k`` that read only its own states."""
         if self.views is None:
             return self._stack_sensors(placed, believed=True)
         view = self.views[k]
@@ -318,9 +296,7 @@ class DerivedScenario(ScenarioModel):
         )
 
     def _curved(self, plant: Any, view: Any) -> tuple[Any, ...]:
-        """Return f and its Jacobian of the states of a ``view``, the numbers of their inputs, and
-        nan and Q of these states.
-        """
+        """Return f, its Jacobian, the numbers of its inputs, nan, and Q of a ``view``."""
         F, Q = (np.ascontiguousarray(M[view][:, view]) for M in self.believed_pieces[0])
         if isinstance(view, slice):
             return plant.functions, np.arange(plant.m), F, Q
@@ -336,9 +312,7 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def node_infos(self) -> tuple[NodeInfo, ...]:
-        """The facts that each node's filter is given at its start about the node and the network,
-        in the order of ``nodes``.
-        """
+        """The facts about node and network that each filter is given, in the order of ``nodes``."""
         total_information = np.zeros((self.plant.n, self.plant.n))
         for information in self.informations:
             total_information = total_information + information
@@ -383,9 +357,7 @@ class DerivedScenario(ScenarioModel):
         return tuple(places)
 
     def most_rows(self, node: int, placed: PlacedSensor) -> int:
-        """Return the most rows that a sensor of ``node`` (id) has at one instant: in slots a
-        recorded one may have several readings in a slot.
-        """
+        """Return the most rows of a sensor at one instant; a slot may have several readings."""
         sensor = self.sensors[placed.entry]
         if sensor.record is None or not self.slotted:
             return len(sensor.R)
@@ -508,9 +480,7 @@ class DerivedScenario(ScenarioModel):
         return self._with_given_states(curve)
 
     def slot_truth(self, streams: Streams, frames: bool | None = None) -> Any:
-        """Return the true state of one run in slots, a plants.linear.Truth; with ``frames``, by
-        default ``exact_errors``, its local states are relative to an origin that moves.
-        """
+        """Return the true state of a run in slots, a plants.linear.Truth, in ``frames`` or not."""
         frames = self.exact_errors if frames is None else frames
         plant, responses = self.slot_plant, self.input_responses
         truth: Any = RecordedPath(plant.recorded_truth, plant.period)
@@ -537,9 +507,7 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def unknown_samples(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """``unknown``, and a mask (N, n') of the errors of nodes that are unknown; None if all
-        states are known.
-        """
+        """``unknown``, and a mask (N, n') of unknown errors; None if all states are known."""
         if not self.unknown.any():
             return None
         of_nodes = [self.unknown[self.view(k)] for k in range(len(self.nodes))]
@@ -557,16 +525,12 @@ class DerivedScenario(ScenarioModel):
 
     @property
     def tells_models(self) -> bool:
-        """True if the models of nodes tell filters of the input: such in plain Python that do not
-        commute with a shift, so that their coordinates cannot move along with it.
-        """
+        """True if models tell filters of the input: those that do not commute with a shift."""
         return self.plant.linear and self.knows_input and not commutes(self.node_filter)
 
     @cached_property
     def input_responses(self) -> InputResponses | None:
-        """The responses to the input of the plant; None if it has none, or is not linear: f takes u
-        then.
-        """
+        """The responses to the input; None without one, or if the plant is not linear."""
         if self.plant.input is None or not self.plant.linear:
             return None
         # Recorded states have the true response in them.
@@ -579,8 +543,8 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def surprise(self) -> Response | None:
-        """The part of the response to the input, by the matrices of the plant, that is left in the
-        state in the coordinates of the filters; None if it is 0, or the plant is not linear.
+        """The response to the input that is left in the coordinates of filters; None if it is 0, or
+        the plant is not linear.
         """
         if self.plant.input is None or not self.plant.linear:
             return None
@@ -611,9 +575,8 @@ class DerivedScenario(ScenarioModel):
         return FlowResponse(pieces, self.plant.changes[: count - 1], u)
 
     def origins(self, times: np.ndarray, local: FloatArray, x: FloatArray) -> FloatArray:
-        """Return where the coordinates of filters begin at K ``times`` (K,), in seconds or slots:
-        (K, n), from states ``local`` to them and absolute ones ``x`` (K, n), or from what is known
-        without a state where the truth is recorded.
+        """Return where coordinates of filters begin at ``times`` (K,), (K, n), from ``local`` and
+        absolute states, or from what is known where the truth is recorded.
         """
         if self.plant.is_random or self.input_responses is None:
             # A state that is not known has no coordinates but those of the filters.
@@ -692,10 +655,9 @@ class DerivedScenario(ScenarioModel):
     def observation_matrices(
         self, node: int, believed: bool = False
     ) -> tuple[FloatArray, FloatArray]:
-        """Return ``H`` (p, n) and ``R`` (p, p) of all sensors of a node together; p may be 0.
-
-        Over a diffusion these are the sensors that give increments. With ``believed``, R is the one
-        that the filter uses. Raises TheoryError if a sensor is nonlinear or its H varies.
+        """Return ``H`` (p, n) and ``R`` (p, p), of filters if ``believed``, of all sensors of a
+        node, of a diffusion those with increments. Raises TheoryError for a nonlinear or varying
+        one.
         """
         sensors_of_nodes = self.placed_sensors if self.slotted else self.increment_sensors
         placed_sensors = sensors_of_nodes.get(node, ())
@@ -730,10 +692,7 @@ class DerivedScenario(ScenarioModel):
         return {}
 
     def sample_times(self, streams: Streams) -> dict[tuple[int, int], FloatArray]:
-        """Return the sample times (K,) in seconds of each sensor (node, ordinal) in one run.
-
-        Only sensors that sample a diffusion are in it; times are below the horizon.
-        """
+        """Return sample times (K,) in seconds by sensor (node, ordinal) of a diffusion."""
         return sample_times(self, streams)
 
     def sample_path(self, streams: Streams, node: int, placed_sensor: PlacedSensor) -> Samples:
@@ -774,9 +733,7 @@ class DerivedScenario(ScenarioModel):
         return FaultyReadings(path, fault, random, when)
 
     def _moves_readings(self, sensor: Sensor) -> Response | None:
-        """Return the response that states are counted from, if readings of the sensor depend on
-        it: drawn linear ones of healthy sensors are of the local state.
-        """
+        """Return the response that readings of the sensor depend on; None if on local states."""
         responses = self.input_responses
         drawn = sensor.linear and sensor.is_random and sensor.fault is None
         if responses is None or drawn:
@@ -785,10 +742,7 @@ class DerivedScenario(ScenarioModel):
 
     @property
     def filters_know_the_truth(self) -> bool:
-        """True if the believed matrices, of the plant and R of all sensors, are the true ones.
-
-        False if states or readings are recorded: their true matrices are unknown.
-        """
+        """True if the filters' matrices are the true ones, False with recorded parts."""
         if not self.is_random or self.misses_input:
             return False
         pieces: Any = self.plant.pieces[: 1 + int((self.plant.changes < self.horizon).sum())]
@@ -842,10 +796,8 @@ class DerivedScenario(ScenarioModel):
         return FlowModel(A, Q, H, R, self.horizon, min(period, self.horizon))
 
     def initial_estimate(self, node: int) -> tuple[FloatArray, FloatArray]:
-        """Return ``xhat`` (n,) and ``P`` (n, n) of a node at time 0.
-
-        ``filter.mean`` and ``filter.cov`` are one array for all nodes, or a tuple of one for each
-        node; where they are not given, mean and covariance of x(0) are used.
+        """Return ``xhat`` (n,) and ``P`` (n, n) of a node at time 0: of ``filter.mean`` and
+        ``filter.cov``, or of x(0).
         """
         index, mean, cov = self.topology.index[node], self.filter.mean, self.filter.cov
         if mean is None:
@@ -860,9 +812,7 @@ class DerivedScenario(ScenarioModel):
         return xhat[view], P[np.ix_(view, view)]
 
     def fresh_estimate(self, node: int, when: float) -> tuple[FloatArray, FloatArray]:
-        """Return ``initial_estimate`` of a node that begins again at ``when``, in seconds or a
-        slot: in the coordinates of filters, which follow the response to a known input.
-        """
+        """Return ``initial_estimate`` of a node that begins again ``when`` (s or slot)."""
         (mean, cov), responses = self.initial_estimate(node), self.input_responses
         if responses is None or responses.believed is None:
             return mean, cov
@@ -892,11 +842,8 @@ class DerivedScenario(ScenarioModel):
         ]
 
     def weight(self, receiver: int, sender: int) -> float:
-        """Return the weight that ``receiver`` (id) gives to the estimate of ``sender`` (id) when it
-        averages estimates: pi_ij of paper H (7), a_ji of paper D (8).
-
-        The weights are those of the filter's matrix, rows senders and columns receivers, or else
-        depend on the degrees of both nodes.
+        """Return the weight of the estimate of ``sender`` (id) at ``receiver``, pi_ij of paper H
+        (7), a_ji of paper D (8): of the filter's matrix, rows senders, or by the degrees of both.
         """
         weights, topology = self._link_weights, self.topology
         if weights.matrix is not None:
@@ -913,9 +860,7 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def own_weights(self) -> dict[int, float]:
-        """The weight (in [0, 1], by node id) that each node gives to its own estimate when it
-        averages it with those of its neighbours, if messages of all of them arrive: 1 minus theirs.
-        """
+        """The weight of each node's own estimate (by id) if all messages arrive: 1 minus theirs."""
         own_weights = dict.fromkeys(self.nodes, 1.0)
         for sender, receiver in self.topology.directions:
             own_weights[receiver] -= self.weight(receiver, sender)
@@ -923,11 +868,8 @@ class DerivedScenario(ScenarioModel):
         return {node: max(weight, 0.0) for node, weight in own_weights.items()}
 
     def effective_rates(self) -> dict[Link, float]:
-        """Return the mean rate of delivered messages on each directed link, per second, from which
-        the theory computes its bounds in continuous time.
-
-        Keys are (sender, receiver); values are nan if they are unknown before a run. Empty in slots
-        and for filters that exchange no messages.
+        """Return the mean rate of delivered messages by (sender, receiver), per second, nan if
+        unknown before a run; empty in slots and without exchange.
         """
         return dict(self._effective_rates)
 

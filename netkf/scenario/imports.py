@@ -48,10 +48,8 @@ class Origin(NamedTuple):
 
 
 def find_class(kind: str, origin: Origin) -> Any:
-    """Return the object that ``kind``, "package.module:Class", names.
-
-    Returns None if it is not loaded yet and ``origin.imports`` is false. Raises ScenarioError if it
-    may not be imported, or if the import fails.
+    """Return the object that ``kind``, "package.module:Class", names; None if it is not loaded and
+    ``origin.imports`` is false. Raises ScenarioError if it may not or cannot be imported.
     """
     module_name, _, class_name = kind.partition(":")
     if module_name.partition(".")[0] != "netkf":
@@ -74,10 +72,8 @@ def find_class(kind: str, origin: Origin) -> Any:
 
 
 def find_offered_class(kind: str, origin: Origin) -> Any:
-    """Return the class that an installed package offers as ``kind``, one of ``offered_kinds``.
-
-    Returns None if it is not loaded yet and ``origin.imports`` is false. Raises ScenarioError if
-    only a folder that needs trust offers it, if several packages do, or if the import fails.
+    """Return the class that a package offers as ``kind``; None if it is not loaded and
+    ``origin.imports`` is false. Raises ScenarioError if none, or several, offer it.
     """
     path = sys.path if origin.trust else _installed_path(origin.folder)
     offers = [entry for entry in _offers(tuple(path)) if entry.name == kind]
@@ -97,9 +93,7 @@ def find_offered_class(kind: str, origin: Origin) -> Any:
 
 
 def offered_kinds(cls: type | None = None) -> list[str]:
-    """Return the kinds that installed packages offer; of a class ``cls`` only those that name it,
-    if its module is loaded.
-    """
+    """Return the kinds that installed packages offer, of a class ``cls`` if it is loaded."""
     offers = _offers(tuple(sys.path))
     return sorted({entry.name for entry in offers if cls is None or _loaded_class(entry) is cls})
 
@@ -162,10 +156,7 @@ def _import_error(kind: str, error: BaseException) -> ScenarioError:
 
 
 def is_loaded(module_name: str, class_name: str, folder: Path) -> bool:
-    """Return True if a class is loaded already, so that finding it executes nothing.
-
-    A module in ``folder``, that of the scenario, takes precedence over a loaded one of its name.
-    """
+    """Return True if a class is loaded, and ``folder`` has no module of that name."""
     module = sys.modules.get(module_name)
     return hasattr(module, class_name) and not _is_namesake(module, module_name, folder)
 

@@ -193,10 +193,7 @@ class PlacedSensor(NamedTuple):
 
 
 def takes_samples(sensor: Sensor) -> bool:
-    """Return True if a sensor of a diffusion takes samples, False if it gives increments.
-
-    A sample is y = H x + v at an instant; increments are those of dy = H x dt + dv.
-    """
+    """Return True if a sensor of a diffusion samples y = H x + v, False for increments."""
     return sensor.record is not None or (
         isinstance(sensor, (LinearSensor, NonlinearSensor)) and sensor.sampling is not None
     )
@@ -239,9 +236,8 @@ class ScenarioModel(Component):
     sensor_entries: tuple[int, ...] = dataclasses.field(default=(), init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Check the fields, and read tables anew that were read without ``time`` or names of nodes;
-        raises ScenarioError for a mistake in either. Plant and sensors of blocks become those of
-        the stacked state; ``declared_sensors`` are the sensors as they were given.
+        """Check the fields, and read tables anew that were read without ``time`` or names; raises
+        ScenarioError. Plant and sensors of blocks become those of the stacked state.
         """
         super().__post_init__()
         for name in ("plants", "plant", "sensors", "network", "filter"):
@@ -328,9 +324,7 @@ class ScenarioModel(Component):
 
     @cached_property
     def is_estimated(self) -> np.ndarray:
-        """A mask (N, n) of the states that nodes estimate, of the n of that with most: the first of
-        each.
-        """
+        """A mask (N, n) of the states that nodes estimate: the first of each."""
         entries = np.arange(self.width)
         views = self.views or [entries] * len(self.nodes)
         return np.array([entries < len(view) for view in views])
@@ -342,9 +336,7 @@ class ScenarioModel(Component):
 
     @cached_property
     def state_labels(self) -> tuple[str, ...]:
-        """The labels (width,) of the columns x0, x1, ...: names and units that plants give, as
-        ``x (m)``; that of the column where they give none, or nodes estimate different states.
-        """
+        """The labels (width,) of x0, x1, ..., as ``x (m)``; names of columns where these differ."""
         labels = {
             place.key: plant.labels
             for place, (_, plant) in zip(self.layout.places, self.all_plants, strict=True)
@@ -374,9 +366,7 @@ class ScenarioModel(Component):
 
     @property
     def states_note(self) -> str:
-        """The names and units of the states by plant, as ``states: x (m), y (m)``; empty if no
-        plant gives them.
-        """
+        """The names and units of states by plant, as ``states: x (m), y (m)``; or empty."""
         parts = []
         for name, plant in self.all_plants:
             labels = [self._column_label(k, {label}) for k, label in enumerate(plant.labels)]
@@ -387,9 +377,7 @@ class ScenarioModel(Component):
         return f"states: {'; '.join(parts)}" if parts else ""
 
     def labels_of_readings(self, node: int) -> list[str]:
-        """Return the labels of the values that all sensors of a ``node`` (-1: of all nodes) read,
-        in their order: of states, as in ``states_note``, of ranges and bearings; else empty.
-        """
+        """Return labels of the values that sensors of a ``node`` (-1: of all) read, in order."""
         of_plants = [enumerate(plant.labels) for _, plant in self.all_plants]
         states = [x and self._column_label(k, {x}) for plant in of_plants for k, x in plant]
         owners = [node] if node >= 0 else [*self.placed_sensors]
@@ -414,9 +402,7 @@ class ScenarioModel(Component):
             yield of_row.pop() if is_plain else ""
 
     def label_of_value(self, node: int, number: int, sizes: np.ndarray) -> str:
-        """Return the label of the value ``number`` of readings of a ``node``, which have ``sizes``
-        (M,) values; empty if it has none, or readings differ in what they read.
-        """
+        """Return the label of value ``number`` of readings of ``sizes`` (M,), or empty."""
         labels = self.labels_of_readings(node)
         is_whole = bool((sizes == len(labels)).all())
         return labels[number] if is_whole else labels[0] if len(set(labels)) == 1 else ""
@@ -472,9 +458,7 @@ class ScenarioModel(Component):
 
     @property
     def network_changes(self) -> bool:
-        """True if it changes in a run who can hear whom, when or how well: nodes move or are down,
-        or messages wait for each other.
-        """
+        """True if who hears whom changes: nodes move or are down, or messages wait."""
         return self.links_move or bool(self.network.lives) or self.messages_queue
 
     @property
@@ -501,9 +485,7 @@ class ScenarioModel(Component):
 
     @cached_property
     def departures(self) -> tuple[tuple[str, str], ...]:
-        """Assumptions of filters that do not hold, each with its reason: clocks, sensors, messages
-        and gates.
-        """
+        """Assumptions of filters that do not hold, each with its reason."""
         found = []
         if self.network.clocks:
             evidence = (
@@ -541,9 +523,7 @@ class ScenarioModel(Component):
 
     @property
     def is_linear(self) -> bool:
-        """True if the dynamics and all readings are linear in the state, and nothing departs from
-        what filters assume.
-        """
+        """True if dynamics and readings are linear, and nothing departs from assumptions."""
         return self.plant.linear and self.has_linear_sensors and not self.departures
 
     @property
@@ -615,10 +595,8 @@ class ScenarioModel(Component):
 
     @property
     def end_time(self) -> float:
-        """The time in seconds after which nothing is simulated.
-
-        It is the horizon, or in slots one period later if states are sampled after the exchanges of
-        their slot.
+        """The end of simulation (s): the horizon, or a period later if the last slot is sampled
+        after its exchanges.
         """
         if not self.slotted or self.node_filter.timing.predicts:
             return self.horizon
@@ -626,10 +604,7 @@ class ScenarioModel(Component):
 
     @property
     def phase_length(self) -> float:
-        """Seconds that an exchange phase of a slot lasts; its steps share them evenly.
-
-        By default all exchange phases together last half a period.
-        """
+        """Seconds of an exchange phase, shared by its steps; by default all last half a period."""
         activation = self.network.activation
         assert isinstance(activation, SlotActivation)
         if activation.phase is not None:
@@ -639,9 +614,7 @@ class ScenarioModel(Component):
 
     @cached_property
     def placed_sensors(self) -> dict[int, tuple[PlacedSensor, ...]]:
-        """The sensors of each node that has any, by node id in increasing order, but for those that
-        are held out.
-        """
+        """The sensors of each node that has any, by id, without those that are held out."""
         return self._place_sensors(held_out=False)
 
     @cached_property
@@ -673,9 +646,7 @@ class ScenarioModel(Component):
         return self.plant.is_random and all(sensor.is_random for sensor in self.sensors)
 
     def noise_covariance(self, entry: int, *, believed: bool) -> FloatArray:
-        """Return R (p, p) of the ``[[sensors]]`` entry with this index: the one that filters assume
-        if ``believed``, else the true one.
-        """
+        """Return R (p, p) of a ``[[sensors]]`` entry: of filters if ``believed``, or true."""
         believed_R = self.filter.model.R
         if not believed or believed_R is None:
             true_R: FloatArray = self.sensors[entry].R
@@ -700,9 +671,7 @@ class ScenarioModel(Component):
         return {node: bad for node, bad in found.items() if bad}
 
     def transmission(self, link: Link) -> Transmission:
-        """Return what is known beforehand of message 0 on a directed link: its entry in the graph's
-        table is 0 if the table does not list the link, its distance nan if nodes move.
-        """
+        """Return message 0 on a link: its entry in the graph's table (0 without), and distance."""
         delivery, distance = self.topology.delivery, math.nan
         if self.network.channel.loss.follows_distance and not self.positions.moving:
             distance = self.positions.distance(link)
@@ -723,9 +692,7 @@ class ScenarioModel(Component):
         return {sender: tuple(receivers) for sender, receivers in found.items()}
 
     def message_size(self, node: int, phase: int) -> float:
-        """Return the bytes of a message that ``node`` (id) sends in an exchange number ``phase`` of
-        a slot, -1 under clocks.
-        """
+        """Return the bytes of a message of ``node`` (id) in a ``phase`` of a slot, or -1."""
         if (node, phase) not in self._message_sizes:
             radio, index = self.network.radio or Radio(), self.topology.index[node]
             # Some filters send their readings.
@@ -769,9 +736,7 @@ class ScenarioModel(Component):
         return longest + radio.seconds(largest)
 
     def mean_delivery(self, link: Link) -> float:
-        """Return the fraction of messages of a directed link that arrive in the long run, nan if it
-        is unknown before a run.
-        """
+        """Return the share of messages of a link that arrive in the long run; nan if unknown."""
         if self.topology.radius is not None or self.network_changes:
             return math.nan
         return self.network.channel.mean_delivery(self.transmission(link))

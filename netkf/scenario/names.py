@@ -16,11 +16,8 @@ Names = Mapping[str, int]
 
 
 def bind_names(part: Any, names: Names | None) -> Any:
-    """Return a component, or a tuple of components, with ids in place of ``names`` of nodes, in its
-    fields and in the tables that it reads; the same object if it has none. Graphs, which know
-    their own names, are left as they are. ``names`` is None if nodes cannot have any.
-
-    Raises ScenarioError for a name that the graph does not have.
+    """Return a component with ids in place of ``names`` of nodes, in fields and tables; graphs
+    stay. ``names`` is None if nodes have none. Raises ScenarioError for a name without a node.
     """
     ids = names or {}
 
@@ -59,9 +56,7 @@ def _bind_nodes(value: Any, names: Names | None, key: str = "") -> Any:
 
 
 def map_nodes(value: Any, change: Callable[[Any], Any]) -> Any:
-    """Return the value of a field of nodes with ``change`` applied to each node: a node, a tuple of
-    nodes, or a tuple of tuples of nodes and a number. The same object if nothing changes.
-    """
+    """Return a field of nodes with ``change`` applied to each; the same object if equal."""
     if isinstance(value, tuple):
         items = tuple(map_nodes(item, change) for item in value)
         return value if all(map(operator.is_, items, value)) else items

@@ -19,21 +19,15 @@ from netkf.plants.dynamics import CustomDynamics
 
 
 def user_components(value: Any) -> list[Component]:
-    """Return the components in a scenario, a component or a tuple whose classes are not netkf's.
-
-    Each comes before the components inside it. Dynamics may be of any class.
-    """
+    """Return the components in a scenario that are not netkf's, inner ones after outer ones."""
     parts: Iterator[Any] = (part for part in walk(value) if isinstance(part, Component))
     parts = (part.part if isinstance(part, CustomDynamics) else part for part in parts)
     return [part for part in parts if not is_netkf_class(type(part))]
 
 
 def find_unimportable_class(scenario: Any, in_script: bool = True) -> str | None:
-    """Return the name of a user's class in a scenario that other processes cannot import.
-
-    Such a class is defined in a function, or in the module ``__main__`` of a notebook or a prompt.
-    With ``in_script`` a class of the running script counts as importable: worker processes run the
-    script again. Returns None if all classes can be imported.
+    """Return the name of a user's class that other processes cannot import, defined in a function
+    or a prompt, or, unless ``in_script``, in the running script; None without one.
     """
     main_file = getattr(sys.modules.get("__main__"), "__file__", None)
     has_script = main_file is not None and Path(main_file).is_file()
@@ -46,11 +40,8 @@ def find_unimportable_class(scenario: Any, in_script: bool = True) -> str | None
 
 
 def unguarded_line(scenario: Any) -> tuple[int, int] | None:
-    """Return the line of a class of the running script (``__main__``) in a scenario, and the line
-    of the script that is being executed, if that is not under ``if __name__ == "__main__":``; else
-    None.
-
-    Worker processes run a script again to find its classes, and with it whatever is not guarded.
+    """Return the line of a class of the running script, and that of the script being executed if
+    not under ``if __name__ == "__main__":``, else None: worker processes run a script again.
     """
     classes = [type(one) for one in user_components(scenario) if type(one).__module__ == "__main__"]
     file = getattr(sys.modules.get("__main__"), "__file__", None)
@@ -77,11 +68,7 @@ def unguarded_line(scenario: Any) -> tuple[int, int] | None:
 
 
 def find_module_files(scenario: Component) -> dict[str, Path | None]:
-    """Return the file of each module of users' classes, by module name, of which a run's directory
-    gets a copy.
-
-    It is None if the module is not a file in the folder of the scenario.
-    """
+    """Return the files of modules of users' classes by name, None for those outside its folder."""
     folder = getattr(scenario, "_folder", None)
     files: dict[str, Path | None] = {}
     for component in user_components(scenario):

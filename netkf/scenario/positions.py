@@ -21,9 +21,7 @@ PLACE = "add position = [...] to the [[plants]] of these nodes, or network.posit
 
 
 def placed_nodes(scenario: Any) -> list[int | str]:
-    """Return the nodes, by id or name, of which plants or ``network.positions`` say where they are,
-    before the graph is known.
-    """
+    """Return nodes, by id or name, whose place plants or ``network.positions`` say."""
     listed = [
         node
         for block in scenario.plants
@@ -40,9 +38,7 @@ def placed_nodes(scenario: Any) -> list[int | str]:
 
 
 def table_of_positions(scenario: Any) -> PositionTable | None:
-    """Return the table ``network.positions``, None without one; raises ScenarioError for a mistake
-    in it, or unless it places just the nodes that the plant does not.
-    """
+    """Return the table ``network.positions``, or None; raises ScenarioError for a mistake."""
     source = scenario.network.positions
     if source is None:
         return None
@@ -64,10 +60,7 @@ def table_of_positions(scenario: Any) -> PositionTable | None:
 
 
 def positions_of(scenario: Any) -> Positions:
-    """Return where nodes are: by their own plants, else by ``network.positions``, else the graph.
-
-    Raises ScenarioError where these have different numbers of coordinates.
-    """
+    """Return where nodes are: by plants, else by ``network.positions``, else by the graph."""
     entries, table = _entries_of_nodes(scenario), scenario.position_table
     points = scenario.topology.positions if table is None else table.points
     fixed = {k: xy for k, xy in (points or {}).items() if k not in entries}
@@ -97,9 +90,7 @@ def _entries_of_nodes(scenario: Any) -> dict[int, IntArray]:
 
 
 def check_positions(scenario: Any, on_grid: bool) -> None:
-    """Raise ScenarioError unless it is known where all nodes are, if messages depend on it;
-    ``on_grid``: the states of a diffusion are drawn on a grid of sensing periods.
-    """
+    """Raise ScenarioError unless it is known where nodes are, if messages depend on it."""
     loss, positions = scenario.network.channel.loss, scenario.positions
     if not loss.follows_distance and scenario.topology.radius is None:
         return
@@ -117,9 +108,7 @@ def check_positions(scenario: Any, on_grid: bool) -> None:
 
 
 def tick_times(scenario: Any, streams: Streams) -> FloatArray:
-    """Return the increasing instants (K,), in seconds, at which a clock of the network ticks in one
-    run in continuous time. Nodes that transmit after samples do so at sample times.
-    """
+    """Return the instants (K,) of ticks of a clock in a run; of samples if these trigger."""
     clock = scenario.network.activation
     entities = clock.entities(scenario.topology) if isinstance(clock, LinkClock) else ()
     instants = [np.empty(0), *(ticks_of(scenario, streams, entity) for entity in entities)]
@@ -129,9 +118,7 @@ def tick_times(scenario: Any, streams: Streams) -> FloatArray:
 
 
 def ticks_of(scenario: Any, streams: Streams, entity: tuple[int, ...]) -> FloatArray:
-    """Return the increasing instants (K,), in seconds, at which the clock of an ``entity`` of the
-    network ticks in one run.
-    """
+    """Return the instants (K,), in seconds, at which the clock of an ``entity`` ticks."""
     clock = scenario.network.activation
     phase, random = (
         partial(streams.generator, "phase", *entity),

@@ -29,9 +29,7 @@ ANOTHER = 'use another filter, as kind = "diffusion"'
 
 
 def check_preconditions(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError at the first need of the filter that a scenario does not meet; it names
-    the key, the filter, the value and a remedy.
-    """
+    """Raise ScenarioError at the first need of the filter that a scenario does not meet."""
     needs = scenario.node_filter.needs
     _check_one_model(scenario, needs.one_model)
     if not scenario.slotted:

@@ -96,10 +96,8 @@ def _read_text(path: Path) -> str:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Return the tables of a TOML text, as ``tomllib.loads`` does.
-
-    Raises ScenarioError for a key of more than MAX_DOTS parts and for tables and lists nested
-    deeper than MAX_DEPTH, ValueError and RecursionError for other invalid texts.
+    """Return the tables of a TOML text. Raises ScenarioError above MAX_DOTS and MAX_DEPTH,
+    ValueError and RecursionError for other invalid texts.
     """
     lines = text.splitlines()
     for number, line in enumerate(lines, 1):

@@ -22,9 +22,7 @@ from netkf.scenario.sampling import all_sample_times, is_drawn_from, sample_time
 
 
 def blocks_without_law(scenario: DerivedScenario) -> dict[Place, str]:
-    """Return why the errors of blocks have no law that is known, by block: their states or their
-    readings are recorded, or their states are not known.
-    """
+    """Return why errors of blocks have no known law: recorded or unknown states or readings."""
     reasons, n = {}, scenario.plant.n
     drawn = np.full(n, scenario.plant.draws)
     if not scenario.plant.is_random and scenario.plant.draws:
@@ -49,9 +47,7 @@ def unjudged_line(scenario: DerivedScenario) -> str:
 
 
 def nodes_with_law(scenario: DerivedScenario) -> np.ndarray:
-    """Return a mask (N,) of the nodes whose errors follow a known law: those that neither estimate
-    nor read what has none, nor hear of it.
-    """
+    """Return a mask (N,) of nodes that neither estimate, read nor hear of what has no law."""
     lost = blocks_without_law(scenario)
     known = np.full(len(scenario.nodes), not lost)
     if not lost or scenario.node_filter.timing.pooled:
@@ -120,11 +116,8 @@ def _check_readings(scenario: DerivedScenario, key: str, sensor: Sensor) -> None
 
 
 def sensed_slots(scenario: DerivedScenario) -> range:
-    """Return the slots in which a run gives readings to its filters.
-
-    Prediction filters use the readings of all slots before the horizon. Others start with the
-    estimate of slot 0 and use readings from slot 1 on, that of a slot at the horizon only if its
-    state is sampled.
+    """Return the slots whose readings filters get: before the horizon if they predict; else from 1
+    on, at the horizon only if its state is sampled.
     """
     plant = scenario.slot_plant
     # The first slot at or after the horizon; the quotient may be off by rounding.
@@ -157,9 +150,7 @@ def _check_exchanges(scenario: DerivedScenario) -> None:
 
 
 def exchange_slots(scenario: DerivedScenario) -> range:
-    """Return the slots in which nodes exchange messages: from the filter's first to the last in
-    which it is given readings.
-    """
+    """Return the slots with exchanges: from the filter's first to the last with readings."""
     return range(scenario.node_filter.timing.first_exchange, sensed_slots(scenario).stop)
 
 
@@ -223,9 +214,7 @@ def _state_times(scenario: DerivedScenario, place: Place) -> FloatArray:
 
 
 def _state_slots(scenario: DerivedScenario, place: Place) -> set[int]:
-    """Return the slots whose states of a block a run needs: the sampled ones, those with drawn
-    readings of it, and those with messages where links follow the state.
-    """
+    """Return the slots whose states of a block a run needs."""
     slots = {*scenario.sampled_slots}
     if any(is_drawn_from(scenario, sensor, place) for sensor in scenario.sensors):
         slots.update(sensed_slots(scenario))
@@ -233,9 +222,7 @@ def _state_slots(scenario: DerivedScenario, place: Place) -> set[int]:
 
 
 def record_notes(scenario: DerivedScenario) -> tuple[str, ...]:
-    """Return lines on recorded exchanges in slots without exchanges, and on contacts that overlap
-    or are missing.
-    """
+    """Return lines on exchanges in slots without any, and on contacts that overlap or miss."""
     activation = scenario.network.activation
     if isinstance(activation, Contacts):
         return activation.notes(scenario.topology)

@@ -178,10 +178,7 @@ SLOTTED = (SlotPlant,)
 
 
 def explain_kind_mismatch(family: str, kind: object) -> str | None:
-    """Return the reason if a kind exists for the other model of time only, else None.
-
-    The models of time are slots (``family`` begins with "slot ") and continuous time.
-    """
+    """Return the reason if a kind exists for the other model of time only, else None."""
     other = family.removeprefix("slot ") if family.startswith("slot ") else f"slot {family}"
     if not isinstance(kind, str) or kind not in KINDS.get(other, {}) or kind in KINDS[family]:
         return None
@@ -189,20 +186,15 @@ def explain_kind_mismatch(family: str, kind: object) -> str | None:
 
 
 def explain_time_mismatch(slotted: bool) -> str:
-    """Return the text of the rule that a component breaks which does not fit the plant's time.
-
-    ``slotted`` is True if the plant is in slots and the component needs continuous time.
-    """
+    """Return the rule that a component breaks which does not fit the plant's time."""
     slots, flow = "in slots (linear)", "in continuous time (diffusion)"
     needed_time, plant_time = (flow, slots) if slotted else (slots, flow)
     return f"belongs to plants {needed_time}, and this plant is {plant_time}"
 
 
 def list_names_of_kind(family: str, kind: object) -> dict[str, dict[str, str]]:
-    """Return the names in KINDS[family] of one kind, each with the keys that choose it.
-
-    For example, track fusion has one name for each value of ``rule``, chosen by {"rule": "ci"}; a
-    kind with a single class has one name, chosen by {}.
+    """Return the names in KINDS[family] of one kind, each with the keys that choose it, such as
+    {"rule": "ci"} of track fusion; {} for a single class.
     """
     choices: dict[str, dict[str, str]] = {}
     for name in KINDS[family]:
@@ -294,10 +286,8 @@ def _require_part(family: str, kind: str, cls: Any) -> type[Component] | None:
 
 
 def name_of(family: str, component: Component) -> str:
-    """Return the name of a component's class in KINDS, the kind as which an installed package
-    offers it, or its ``package.module:Class``.
-
-    ``family`` may be that without "slot" or "continuous": these families are searched too.
+    """Return the name of a class in KINDS, of an offered kind, or ``package.module:Class``;
+    ``family`` may lack "slot" or "continuous".
     """
     others = (KINDS.get(f"{time} {family}", {}) for time in ("slot", "continuous"))
     for classes in (KINDS[family], *others):
@@ -311,8 +301,6 @@ def name_of(family: str, component: Component) -> str:
 
 
 def kind_name(component: Component, family: str = "filter") -> str:
-    """Return the name of a component of a ``family`` for messages: that in KINDS, else that of its
-    class.
-    """
+    """Return the name of a component for messages: that in KINDS, else of its class."""
     name = name_of(family, component)
     return type(component).__name__.lower() if ":" in name else name

@@ -29,10 +29,7 @@ MAX_SAMPLES = 1e9  # samples of one sensor; more suggest a wrong unit of time
 
 
 def sample_times(scenario: ScenarioModel, streams: Streams) -> dict[tuple[int, int], FloatArray]:
-    """Return the sample times (K,) in seconds of each sensor (node, ordinal) in one run.
-
-    Only sensors that sample a diffusion are in it; times are below the horizon.
-    """
+    """Return sample times (K,) in seconds by sensor (node, ordinal) of a diffusion."""
     return {
         (node, placed_sensor.ordinal): times_of_sensor(scenario, streams, node, placed_sensor)
         for node, placed_sensor in _iterate_sampled_sensors(scenario)
@@ -77,10 +74,7 @@ def _make_generator(
 
 
 def sample_rate(scenario: ScenarioModel, node: int) -> float:
-    """Return the mean rate at which a node takes samples, per second.
-
-    It is nan if unknown before a run, and for several sensors, which may sample at one instant.
-    """
+    """Return the mean rate of a node's samples; nan if unknown, and for several sensors."""
     placed_sensors = scenario.sampled_sensors.get(node, ())
     if len(placed_sensors) != 1:
         return math.nan if placed_sensors else 0.0
@@ -90,17 +84,12 @@ def sample_rate(scenario: ScenarioModel, node: int) -> float:
 
 
 def all_sample_times(times: dict[tuple[int, int], FloatArray]) -> FloatArray:
-    """Return the increasing instants (K,), in seconds, at which any sensor samples; ``times`` has
-    those of each sensor, by (node, ordinal).
-    """
+    """Return the increasing instants (K,) at which any sensor samples."""
     return np.unique(np.concatenate([np.empty(0), *times.values()]))
 
 
 def uses_grid(scenario: ScenarioModel) -> bool:
-    """Return True if the states of a diffusion are drawn on a grid of sensing periods.
-
-    They are if sensors give increments, or if no sensor takes samples.
-    """
+    """Return True if states are drawn on a grid: with increments, or without samples."""
     is_drawn = not scenario.slotted and scenario.plant.is_random and scenario.plant.linear
     return is_drawn and (bool(scenario.increment_sensors) or not scenario.sampled_sensors)
 
@@ -116,10 +105,8 @@ def is_drawn_from(scenario: ScenarioModel, sensor: Any, place: Place) -> bool:
 def require_states(
     scenario: ScenarioModel, times: dict[tuple[int, int], FloatArray], streams: Streams
 ) -> None:
-    """Raise ScenarioError if recorded states lack that at a time that a run needs.
-
-    These are the probe times, the sample times of sensors whose readings are drawn, and ticks where
-    links follow the state. ``times`` are the sample times (K,) in seconds by (node, ordinal).
+    """Raise ScenarioError if recorded states lack that of a probe, of a drawn sample, or of a tick
+    whose links follow the state; ``times`` are sample times by (node, ordinal).
     """
     ticks = tick_times(scenario, streams) if scenario.links_follow_state else np.empty(0)
     for (key, plant), place in zip(scenario.all_plants, scenario.layout.places, strict=True):
@@ -135,10 +122,8 @@ def require_states(
 
 
 def check_sampling(scenario: ScenarioModel) -> None:
-    """Raise ScenarioError if the sampling of a sensor does not fit the plant or the graph.
-
-    Sensors of a recorded or unknown diffusion must take samples, and recorded states must have
-    those that replica 0 needs.
+    """Raise ScenarioError if the sampling of a sensor does not fit plant or graph; recorded states
+    must have those that replica 0 needs.
     """
     for k, sensor in enumerate(scenario.sensors):
         key = scenario.sensor_key(k)

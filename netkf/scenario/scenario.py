@@ -44,11 +44,7 @@ class Scenario(DerivedScenario):
         check_scenario(self)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the fields and the topology for pickle.
-
-        Derived values are computed anew when they are needed. The topology is kept because the
-        file it was read from may not exist where the pickle is loaded.
-        """
+        """Return the fields and the topology, whose file may not exist where this is loaded."""
         names = {field.name for field in dataclasses.fields(self)}
         names |= {"_folder", "_trust", "topology", "time_grid"}
         return {name: value for name, value in self.__dict__.items() if name in names}

@@ -274,10 +274,8 @@ def summary(cls: type) -> str:
 
 
 def describe_field(docstring: str, name: str) -> str:
-    """Return the sentences of a docstring about the field ``name`` on one line, "" if none.
-
-    They are its entry in a list of fields, ``name  description``, where continuation lines are
-    indented, or else all sentences that contain its name in backquotes.
+    """Return the entry ``name  description`` of a docstring on one line, or else all sentences with
+    the name in backquotes.
     """
     entry = re.search(rf"^{re.escape(name)}  +(.+(?:\n +.*)*)", docstring, flags=re.MULTILINE)
     if entry:

@@ -12,9 +12,7 @@ from netkf.scenario.derived import DerivedScenario
 
 
 def require_shape(key: str, value: FloatArray, shape: tuple[int | None, ...], why: str) -> None:
-    """Raise ScenarioError at ``key`` unless the array ``value`` has the ``shape``, in which None is
-    any length; ``why`` is the reason in the message.
-    """
+    """Raise ScenarioError at ``key`` unless ``value`` has the ``shape`` (None: any length)."""
     fits = len(value.shape) == len(shape) and all(
         length is None or actual == length
         for actual, length in zip(value.shape, shape, strict=True)
@@ -27,9 +25,7 @@ def require_shape(key: str, value: FloatArray, shape: tuple[int | None, ...], wh
 
 
 def check_schedule(scenario: DerivedScenario, why: str) -> None:
-    """Raise ScenarioError if matrices of ``plant.schedule`` have wrong shapes, for the reason
-    ``why``, or in slots a change is between two.
-    """
+    """Raise ScenarioError for wrong shapes in ``plant.schedule``, or a change between slots."""
     plant, n = scenario.plant, scenario.plant.n
     for k, change in enumerate(getattr(plant, "schedule", ())):
         for name, value in change.matrices.items():
@@ -53,9 +49,7 @@ def check_schedule(scenario: DerivedScenario, why: str) -> None:
 
 
 def check_changes_on_grid(scenario: DerivedScenario, period: float) -> None:
-    """Raise ScenarioError unless each change of the plant is a point of the sensing grid, which has
-    this ``period`` (seconds).
-    """
+    """Raise ScenarioError unless changes are points of the grid of ``period`` seconds."""
     for k, change in enumerate(scenario.plant.changes.tolist()):
         nearest = scenario.time_grid.instant(round(change / period) * period)
         if change < scenario.horizon and nearest != change:
@@ -69,10 +63,7 @@ def check_changes_on_grid(scenario: DerivedScenario, period: float) -> None:
 
 
 def check_regressor(scenario: DerivedScenario, key: str, sensor: RegressorSensor) -> None:
-    """Raise ScenarioError if a regressor's matrices have wrong shapes or the plant is continuous.
-
-    ``key`` is the key path of the sensor.
-    """
+    """Raise ScenarioError for wrong shapes of a regressor at ``key``, or continuous time."""
     if not scenario.slotted:
         raise ScenarioError(
             f"{key}.kind",
@@ -92,10 +83,7 @@ def check_regressor(scenario: DerivedScenario, key: str, sensor: RegressorSensor
 
 
 def check_nonlinear(scenario: DerivedScenario, key: str, sensor: NonlinearSensor) -> None:
-    """Raise ScenarioError if a nonlinear sensor cannot read the state, or has no positions.
-
-    ``key`` is the key path of the sensor.
-    """
+    """Raise ScenarioError if a nonlinear sensor cannot read the state, or has no positions."""
     with errors_under(key):
         # First as it is: a wrong field is reported before positions that the graph lacks.
         for candidate in (sensor, sensor.located(scenario.topology.positions)):

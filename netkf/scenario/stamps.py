@@ -107,9 +107,7 @@ class Time(Component):
 
 
 def restamp(part: Any, stamps: TimeBase) -> Any:
-    """Return a component, or a tuple of components, whose tables are read with these ``stamps``;
-    the same object if they are already. Raises ScenarioError for what a table then has wrong.
-    """
+    """Return a component whose tables are read with these ``stamps``; raises ScenarioError."""
 
     def change(_: Any, __: Any, value: Any) -> Any:
         if isinstance(value, SourceFile):
@@ -120,9 +118,7 @@ def restamp(part: Any, stamps: TimeBase) -> Any:
 
 
 def stamp_notes(scenario: Any) -> tuple[str, ...]:
-    """Return a line if every record of a scenario begins long after 0, more than half the horizon
-    and ten times its own length: what its stamps are counted from is not what the run begins at.
-    """
+    """Return a line if every record begins long after 0, by horizon and own length."""
     times = [t for t in _recorded_times(scenario) if t.size]
     if scenario.time.origin is not None or not times:
         return ()

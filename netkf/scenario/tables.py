@@ -70,10 +70,7 @@ def change_keys(scenario: S, changes: Mapping[str, Any]) -> S:
 
 
 def explain_left_over(error: ScenarioError, changes: Mapping[str, Any]) -> ScenarioError:
-    """Return ``error``, reworded if it is about a key that a change of kind left behind.
-
-    ``changes`` are the changed values by key path.
-    """
+    """Return ``error``, reworded if it is about a key that a change of kind left behind."""
     table = error.key.rpartition(".")[0]
     if error.rule != UNKNOWN or f"{table}.kind" not in changes or error.key in changes:
         return error
@@ -88,9 +85,8 @@ def source_files(value: Any) -> list[SourceFile]:
 
 
 def change_table(table: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a copy of the tables of a file with the values at key paths replaced or added.
-
-    Raises ScenarioError for a path through a value that is neither a table nor a list.
+    """Return tables with values at key paths replaced or added; raises ScenarioError for a path
+    through a value that is neither a table nor a list.
     """
     for path, value in changes.items():
         keys = path.replace("[", ".").replace("]", "").split(".")
@@ -125,10 +121,7 @@ def _set_key(target: Any, keys: list[str], value: Any, path: str) -> Any:
 
 
 def build_scenario(cls: type[S], table: Mapping[str, Any], origin: Origin) -> S:
-    """Return a scenario of class ``cls`` from the tables of a file.
-
-    Raises ScenarioError, with the path of the key, for the first mistake.
-    """
+    """Return a scenario from the tables of a file; raises ScenarioError with the key's path."""
     # Importing a module executes it, and a file that is refused must execute nothing: everything
     # is checked without imports first.
     scenario = _build(cls, table, origin._replace(imports=False))

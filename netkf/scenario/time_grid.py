@@ -141,9 +141,7 @@ def snap_limits(algorithm: Any, grid: TimeGrid) -> Any:
 
 
 def check_grid(scenario: Any) -> None:
-    """Raise ScenarioError if the instants of a scenario have no grid: ``[time] resolution`` does
-    not fit the horizon or a time, or a time is too short to be seen at the horizon.
-    """
+    """Raise ScenarioError if the resolution fits no horizon or time, or a time is too short."""
     grid, given = scenario.time_grid, scenario.time.resolution
     least = _choose_automatically(scenario).resolution
     if given is not None and given < least:
@@ -176,9 +174,7 @@ def check_grid(scenario: Any) -> None:
 
 
 def grid_notes(scenario: Any) -> tuple[str, ...]:
-    """Return lines on times that are rounded, and on a resolution that is not far below the
-    shortest gap of a clock, delay or window, or the shortest time constant of the plant.
-    """
+    """Return lines on rounded times, and on a resolution not far below gaps and time constants."""
     grid, notes = scenario.time_grid, []
     tick = 1.0 / grid.per_second
     rounded = [

@@ -73,9 +73,7 @@ def record_usage(scenario: DerivedScenario, sent: Mapping[Link, int] | None) -> 
 
 
 def usage_notes(usage: Mapping[str, Use]) -> tuple[str, ...]:
-    """Return a line for each table with unused rows, and for each with messages not listed, from
-    the result of ``record_usage``: notes below the summary of a run.
-    """
+    """Return a line for each table with unused rows or messages not listed."""
     notes = []
     for key, use in usage.items():
         if use["unused"]:
@@ -92,9 +90,7 @@ def usage_notes(usage: Mapping[str, Use]) -> tuple[str, ...]:
 
 
 def unused_notes(scenario: DerivedScenario, without_states: bool = False) -> tuple[str, ...]:
-    """Return a line for each table with rows that no run uses; tables of losses and delays are left
-    out, whose use differs from run to run, and on demand that of recorded states.
-    """
+    """Return a line for each table with rows that no run uses, but losses and delays."""
     usage = record_usage(scenario, sent=None)
     for key in count_state_rows(scenario) if without_states else ():
         del usage[key]

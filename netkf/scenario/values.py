@@ -17,10 +17,7 @@ SHORT_NUMBER = re.compile(r"[+-]?(?:\.\d+|\d+\.)(?:[eE][+-]?\d+)?", re.ASCII)
 
 
 def split_setting(option: str, setting: str) -> tuple[str, str]:
-    """Return the key path and the value's text of ``key.path=value``.
-
-    Raises ScenarioError, with the name of the ``option`` as its key, for another form.
-    """
+    """Return key path and text of ``key.path=value``; raises ScenarioError at ``option``."""
     _require_short(option, setting)
     key, equals, text = (part.strip() for part in setting.partition("="))
     if not equals or not key or not text:
@@ -32,10 +29,8 @@ def split_setting(option: str, setting: str) -> tuple[str, str]:
 
 
 def parse_value(option: str, key: str, text: str) -> Any:
-    """Return the value of a TOML expression or of a number such as ``.5``, or the text itself if it
-    is words without quotes.
-
-    Raises ScenarioError at ``option`` for a text that is neither; ``key`` is named in the message.
+    """Return the value of a TOML expression, a number such as ``.5``, or words without quotes;
+    raises ScenarioError at ``option``.
     """
     try:
         return _parse_toml_value(text)
@@ -48,11 +43,7 @@ def parse_value(option: str, key: str, text: str) -> Any:
 
 
 def parse_values(option: str, key: str, text: str) -> list[Any]:
-    """Return the values of ``v1,v2,...``, TOML expressions or words without quotes.
-
-    Commas inside brackets and quotes do not separate values. Errors name the ``option`` and the
-    ``key``.
-    """
+    """Return the values of ``v1,v2,...``, without splitting inside brackets and quotes."""
     _require_short(option, text)
     try:
         values = _parse_toml_value(f"[{text}]")

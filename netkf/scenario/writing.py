@@ -53,10 +53,7 @@ def as_table(scenario: DerivedScenario) -> dict[str, Any]:
 
 
 def resolve_defaults(scenario: DerivedScenario) -> dict[str, Any]:
-    """Return the tables of a scenario file with all defaults written out.
-
-    A scenario that is read from them has the same runs, even if defaults of netkf change.
-    """
+    """Return the tables of a scenario with all defaults, for the same runs if these change."""
     network = scenario.network
     if isinstance(network.graph, RandomGraph) and network.graph.seed is None:
         graph = dataclasses.replace(network.graph, seed=scenario.seed)
@@ -100,9 +97,7 @@ def _scenario_table(
 
 
 def _block_table(block: Block, stacked: Plant, style: _Style) -> dict[str, Any]:
-    """Return the table of one of [[plants]], with the values of the ``stacked`` plant that all
-    share.
-    """
+    """Return the table of one of [[plants]], with shared values of the ``stacked`` plant."""
     plant = copy.copy(block.plant)
     if style.with_defaults:
         defaults: dict[str, Any] = {"mean": plant.start_mean, "cov": plant.start_cov}
@@ -123,11 +118,7 @@ def _block_table(block: Block, stacked: Plant, style: _Style) -> dict[str, Any]:
 
 
 def part_as_table(part: Component) -> dict[str, Any]:
-    """Return the table of a component of a scenario, without values equal to their defaults.
-
-    ``part`` is a plant, sensor, filter or network, a component inside one of these, a Filtering or
-    a Belief.
-    """
+    """Return the table of a component, without values equal to their defaults."""
     return _part_table(part, _Style())
 
 
@@ -182,11 +173,7 @@ def _toml_value(value: Any, style: _Style) -> Any:
 
 
 def to_toml(table: dict[str, Any]) -> str:
-    """Return the TOML text of nested tables; equal tables give equal text.
-
-    Values are tables, lists, numbers, strings and source files. Tables and lists of tables at the
-    top level are written as sections ``[key]`` and ``[[key]]``, those below on one line.
-    """
+    """Return the TOML text of nested tables; equal tables give equal text."""
     lines = [f"{key} = {toml_text(v)}" for key, v in table.items() if not _is_section(v)]
     for key, value in table.items():
         if isinstance(value, dict):

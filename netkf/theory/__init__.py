@@ -7,9 +7,7 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
-    """Return a public function. All are imported at the first use of one: a run needs few modules
-    of theory, which it imports by their names.
-    """
+    """Return a public function; all are imported at the first use of one."""
     if name.startswith("__") and name != "__all__":
         raise AttributeError(f"module 'netkf.theory' has no attribute {name!r}")
     from netkf.theory.public import PUBLIC

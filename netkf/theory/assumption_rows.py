@@ -55,8 +55,8 @@ def assumptions(scenario: Scenario) -> pd.DataFrame:
 
 
 def assumption_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return a row for each assumption: text, equation, whether it holds, and why. Of a plant that
-    changes the rows are about the last piece, but for that on the filters' model.
+    """Return a row for each assumption: text, equation, whether it holds, and why; of the last
+    piece of a plant that changes, but for the filters' model.
     """
     changes = scenario.plant.changes
     if len(changes):

@@ -23,9 +23,8 @@ LEAST = "error covariance of the central filter of all blocks, below which no fi
 
 
 def block_promises(scenario: Scenario) -> dict[str, Any]:
-    """Return what is promised of each block of each node as plain data: ``P``, a sentence on how P
-    compares with the covariance of the error, and ``blocks``, the covariance of the central filter
-    of all blocks, which no other filter falls below, ``when``, or its ``reason``.
+    """Return as plain data ``P``, how P compares with the covariance of errors, and by block that
+    of the central filter, which no other falls below, ``when``, or the ``reason`` for none.
     """
     reason, when, covariance = None, "steady state", None
     try:
@@ -60,9 +59,7 @@ def _about_P(scenario: Scenario) -> str:
 
 
 def central_at_horizon(scenario: Scenario) -> FloatArray:
-    """Return the covariance (n, n) at the horizon of the central filter of all blocks that knows
-    the plant, from samples at times known beforehand; else TheoryError.
-    """
+    """Return the covariance (n, n) at the horizon of the central filter; else TheoryError."""
     if scenario.increment_sensors:
         raise TheoryError("samples beside increments: the least error covariance is not computed")
     for node, _ in randomly_sampled_sensors(scenario):

@@ -69,19 +69,15 @@ def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> Flo
 
 
 def error_squares(scenario: Scenario, run: Run) -> FloatArray:
-    """Return E[(x - xhat_i)(x - xhat_i)'] (T, N, n, n) at ``run.times``, given the run's events:
-    :func:`error_covariance` and the square of the mean error, which is not 0 where filters start
-    elsewhere than the plant. Raises the errors of that function.
+    """Return E[(x - xhat_i)(x - xhat_i)'] (T, N, n, n) given the events: :func:`error_covariance`
+    and the square of the mean error. Raises its errors.
     """
     return _seen_blocks(scenario, _joint_moments(scenario, run, about_mean=False))
 
 
 def error_law(scenario: Scenario, run: Run) -> ErrorLaw:
-    """Return the joint Gaussian law of all errors at all T ``run.times``, of which there must be
-    some, given the run's events, and P_i by the filter's equations, independently of the engine.
-
-    Unlike :func:`error_covariance` it relates different times, and includes the mean of errors.
-    Nodes that share one pooled filter count once. Raises the errors of :func:`error_covariance`.
+    """Return the joint Gaussian law of errors at all ``run.times`` given the events, with their
+    mean, and P_i by the filter's equations; a pooled filter counts once. Raises the same errors.
     """
     errors, P = _errors_of(scenario, run), []
     for _ in errors.replay():

@@ -54,10 +54,9 @@ LIMITS: dict[str, Callable[[Scenario], FloatArray]] = {
 
 
 def compute_promises(scenario: Scenario) -> dict[str, Any]:
-    """Return what theory states about a scenario without simulation as plain JSON (`netkf theory
-    --json`): assumptions, bounds, link rates and limits, results of the paper, exact steady errors.
-    Matrices have ``value`` and ``trace``, None with a ``reason`` if there is none. Of a plant that
-    changes all but the bound at the horizon is about the last piece.
+    """Return what theory states as plain JSON: assumptions, bounds, rates, limits, results of the
+    paper and exact errors, None with a ``reason``; of the last piece but for the bound at the
+    horizon.
     """
     if have_one_view(scenario):
         scenario = scenario_of_estimates(scenario)

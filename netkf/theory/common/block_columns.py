@@ -59,9 +59,7 @@ class ColumnModel:
     def extrapolate(
         self, xhat: FloatArray, root: FloatArray, age: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the estimate (n, C) and the root (n, n) ``age`` seconds after one that was told;
-        in slots as they are.
-        """
+        """Return the estimate (n, C) and the root (n, n) after ``age`` seconds, as in slots."""
         nothing = np.zeros(len(xhat))
         if age <= 0.0 or isinstance(self.moving, SlotModel):
             return xhat, root
@@ -104,9 +102,7 @@ class BlockColumns(ErrorColumns):
         return first
 
     def _reduce(self, count: int) -> None:
-        """Turn the columns of noises into as few as their rank allows, which leaves products as
-        they are, and make room for ``count`` more.
-        """
+        """Turn columns of noises into as few as their rank allows, with room for ``count``."""
         width, used = self._x.shape[1], self._used
         held = self._x, self._states, self._messages, self._kept
         found: dict[int, FloatArray] = {}
@@ -128,9 +124,7 @@ class BlockColumns(ErrorColumns):
         self._x, self._states, self._messages, self._kept = held
 
     def _move(self, F: FloatArray, root: FloatArray, times: Sequence[float]) -> None:
-        """Move the true state by F (n, n) and a noise with ``root`` (n, k) from the first of two
-        ``times`` (slots, or seconds) to the second.
-        """
+        """Move the true state by F and a noise with ``root`` between two ``times``."""
         first = self._inputs(root.shape[1])
         self._x = F @ self._x
         self._x[:, first : self._used] = root

@@ -27,9 +27,7 @@ def have_one_view(scenario: Scenario) -> bool:
 
 @lru_cache(maxsize=8)
 def scenario_of_view(scenario: Scenario) -> Scenario:
-    """Return the scenario whose whole state are the blocks that all nodes of ``scenario`` estimate:
-    no others drive them, and sensors read no others. Cached with its tables.
-    """
+    """Return the scenario of the blocks that all nodes estimate and nothing else moves."""
     require_linear(scenario)
     assert scenario.views is not None
     view, plant = scenario.views[0], cast(Any, scenario.plant)

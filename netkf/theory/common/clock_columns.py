@@ -197,9 +197,7 @@ class ClockColumns(LoggedColumns):
         self._keep_digits(flows.reading)
 
     def _gap(self, h: int, time: float) -> float:
-        """Return by how many seconds, of its clock, node h is to be predicted to ``time``, where it
-        is then.
-        """
+        """Return the seconds, of its clock, over which to predict node h to ``time``."""
         self._move_increments(time)
         shown = self._shown(h, time)
         self._filters.run.now = shown

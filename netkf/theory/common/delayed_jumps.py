@@ -295,8 +295,8 @@ class DelayedJumps:
 
     @cached_property
     def mean_is_stable(self) -> bool:
-        """True if the mean of the errors dies out, by the map of errors over d seconds (Breda,
-        Maset and Vermiglio 2015, Stability of Linear Delay Differential Equations, chapter 6).
+        """True if the mean of errors dies out, by their map over d seconds (Breda, Maset, Vermiglio
+        2015).
         """
         K, M = self.points + 1, len(self.instant.drift)
 

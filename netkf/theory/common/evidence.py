@@ -24,9 +24,7 @@ TRUE_MODEL = "the filters know the plant and the sensors"
 
 
 def nonlinear_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return a row for dynamics and one for readings that are not linear, and one for each of
-    ``Scenario.departures``; [] if there is none of these.
-    """
+    """Return a row for each of dynamics and readings that are not linear, and departures."""
     parts = {"dynamics": scenario.plant.linear, "readings": scenario.has_linear_sensors}
     rows: list[AssumptionRow] = [
         (f"{part} are linear in the state", "all papers", False, f"{part} are {FOLLOWS_DATA}")
@@ -70,9 +68,7 @@ def life_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def require_linear(scenario: Scenario, accepted: tuple[str, ...] = ()) -> None:
-    """Raise TheoryError if dynamics or readings are not linear, or anything departs from what
-    filters assume but for the assumptions ``accepted``.
-    """
+    """Raise TheoryError for what is not linear, or departs and is not ``accepted``."""
     for assumption, *_, evidence in nonlinear_rows(scenario):
         if assumption not in accepted:
             raise TheoryError(evidence)

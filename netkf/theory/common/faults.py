@@ -47,9 +47,7 @@ class _Alone(NamedTuple):
 
 
 def refusals(scenario: Scenario, node: int, placed: PlacedSensor) -> Refusals | None:
-    """Return how likely the gate refuses each reading of a bad sensor; None if the fault states no
-    law, or times or matrices of readings are not fixed beforehand.
-    """
+    """Return how likely the gate refuses readings of a bad sensor; None if not fixed beforehand."""
     gate, fault = scenario.filter.gate, scenario.fault_of(node, placed)
     sensor = scenario.sensors[placed.entry]
     step = _step(scenario, placed)
@@ -79,8 +77,8 @@ def refusals(scenario: Scenario, node: int, placed: PlacedSensor) -> Refusals | 
 
 
 def innovation_biases(alone: _Alone, biases: FloatArray) -> FloatArray:
-    """Return by how much the innovations (K, p) are off of a filter that uses readings which are
-    off by ``biases`` (K, p): ``z = b - H e`` with ``e <- F (e + K z)``.
+    """Return biases (K, p) of innovations for ``biases`` of readings: z = b - H e, e <- F (e + K
+    z).
     """
     found, e = [], np.zeros(len(alone.F))
     for bias in biases:
@@ -90,9 +88,7 @@ def innovation_biases(alone: _Alone, biases: FloatArray) -> FloatArray:
 
 
 def refused_with_bias(gate: Gate, biases: FloatArray, S: FloatArray) -> FloatArray:
-    """Return the probabilities (K,) that innovations of covariance S (p, p) and means ``biases``
-    (K, p) are refused: the tail of the noncentral chi-square law.
-    """
+    """Return the probabilities (K,) of refusal: the tail of the noncentral chi-square law."""
     noncentral = np.einsum("ki,ki->k", biases, np.linalg.solve(S, biases.T).T)
     return np.asarray(scipy.stats.ncx2.sf(gate.limit(len(S)), len(S), noncentral))
 

@@ -66,9 +66,8 @@ class Forms:
         return frozen[:, : self.frozen]
 
     def _reduce(self, count: int, first: FloatArray | None = None) -> FloatArray:
-        """Replace the inputs that are not frozen by at most as many as rows, triangular in the
-        order of ``first`` (k, used) and the rows, and make room for ``count`` more; return
-        ``first`` in the new columns.
+        """Replace inputs that are not frozen by at most as many as rows, triangular in the order of
+        ``first`` (k, used), with room for ``count``; return ``first`` in the new columns.
         """
         rows, frozen = np.flatnonzero(self._live), self.frozen
         given = np.zeros((0, self.used)) if first is None else first

@@ -53,9 +53,7 @@ class IncrementFlows(NamedTuple):
         roots: FloatArray,
         until: tuple[float, float],
     ) -> None:
-        """Move state and estimates that read increments, rows of ``forms``, from the first to the
-        second time of ``until`` (s).
-        """
+        """Move state and estimates, rows of ``forms``, between the two times ``until`` (s)."""
         now, end = until
         jumps = np.empty(0) if self.surprise is None else self.surprise.jumps
         for stop in [*jumps[(jumps > now) & (jumps < end)].tolist(), end]:
@@ -115,9 +113,7 @@ def integration_steps(scenario: Scenario) -> int:
 
 
 def increment_flows(scenario: Scenario, estimators: int, piece: int = 0) -> IncrementFlows | None:
-    """Return how errors of the first ``estimators`` evolve in a ``piece`` of the plant; None if no
-    sensor has increments.
-    """
+    """Return how errors with increments evolve in a ``piece`` of the plant; None without any."""
     observations = increment_observations(scenario)
     if not any(len(observation.H) for observation in observations):
         return None

@@ -65,9 +65,8 @@ class SlotJumps:
         return self.directions.mean(self.nodes, np.arange(len(self.directions.sender)))
 
     def step(self, X: FloatArray, noise: bool = False) -> FloatArray:
-        """Return the second moments (S, M, M) one slot after X (S, M, M) of the M = N n stacked
-        errors, by mode of the links, each weighted by its probability; with the ``noise`` of plant
-        and readings, or linear.
+        """Return second moments (S, M, M) of M stacked errors one slot after X, weighted by mode of
+        the links; with the ``noise`` of plant and readings, or linear.
         """
         N = self.nodes
         weight = self.directions.stationary if self.directions else np.ones(1)

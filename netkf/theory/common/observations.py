@@ -104,8 +104,8 @@ def _are_the_same(some: list[Observation], others: list[Observation]) -> bool:
 def slot_observations(
     scenario: Scenario, run: Run, join: Callable[..., Any] = stack_observations
 ) -> Callable[[int], dict[int, Any]]:
-    """Return a function from an increasing slot to its readings by index of the estimator, those of
-    all its sensors as ``join(readings, n)`` returns them.
+    """Return a function from an increasing slot to its readings by estimator, as ``join`` makes
+    them.
     """
     streams, n = Streams(run.seed, run.replica), scenario.plant.n
     noises = _noises(scenario)
@@ -146,9 +146,7 @@ def slot_observations(
 def timed_observations(
     scenario: Scenario, streams: Streams, join: Callable[..., Any] = stack_observations
 ) -> dict[float, dict[int, Any]]:
-    """Return the sampled readings of the run with these ``streams`` by time (s) and estimator,
-    equal ones as one object, and those of all sensors as ``join(readings, n)`` returns them.
-    """
+    """Return sampled readings by time (s) and estimator, as ``join`` makes them."""
     n, by_node, noises = scenario.plant.n, scenario.sampled_sensors, _noises(scenario)
     times = sample_times(scenario, streams)
     fixed = [

@@ -107,9 +107,8 @@ class Directions(NamedTuple):
     def products(
         self, first: IntArray, second: IntArray, factor: FloatArray, Z: FloatArray
     ) -> FloatArray:
-        """Return ``sum_p c_p D_a Z D_b'`` (S, N n, N n) over P pairs of directions ``first``,
-        ``second`` (P,), D_a being the change of errors by a message on a; ``factor`` (S, P) is c by
-        mode, Z (S, N n, N n).
+        """Return ``sum_p c_p D_a Z D_b'`` over pairs of directions ``first``, ``second`` (P,), D_a
+        the change by a message on a; ``factor`` (S, P) is c by mode, Z (S, N n, N n).
         """
         n = self.weight.shape[-1]
         S, N = len(Z), Z.shape[1] // n
@@ -153,9 +152,8 @@ def _join_blocks(blocks: FloatArray) -> FloatArray:
 def directions_of(
     scenario: Scenario, weights: dict[tuple[int, int], FloatArray], wait: float
 ) -> Directions:
-    """Return the directed links of a scenario in the order of ``weights`` (n, n) by (sender,
-    receiver), with the law of their losses; messages that take more than ``wait`` seconds are lost.
-    Raises TheoryError without a known law.
+    """Return directed links in the order of ``weights``, with the law of losses; messages that take
+    more than ``wait`` seconds are lost. Raises TheoryError without a known law.
     """
     loss, delay = scenario.network.channel.loss, _known_delay(scenario)
     links, index = list(weights), scenario.topology.index
@@ -179,9 +177,7 @@ def directions_of(
 
 
 def _known_delay(scenario: Scenario) -> float:
-    """Return the delay of all messages, seconds; raises TheoryError without a known law of losses
-    and delays.
-    """
+    """Return the delay (s) of all messages; raises TheoryError without a known law."""
     loss, delay = scenario.network.channel.loss, scenario.network.channel.delay.fixed
     if lacks_channel_law(scenario) or has_recorded_broadcasts(scenario):
         raise TheoryError(no_channel_law(scenario))
@@ -278,9 +274,8 @@ def _deliveries(
 def poisson_ticks(
     scenario: Scenario, links: list[tuple[int, int]]
 ) -> tuple[tuple[float, IntArray], ...]:
-    """Return for each clock at which nodes transmit its rate (1/s) and the indices (K,), in
-    ``links``, of the directions that transmit then. Raises TheoryError for other than Poisson
-    clocks.
+    """Return for each clock its rate (1/s) and the directions (K,) that transmit; TheoryError
+    unless Poisson.
     """
     clock = scenario.network.activation
     assert isinstance(clock, LinkClock)

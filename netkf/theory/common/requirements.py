@@ -35,8 +35,8 @@ def require_scenario(functions: dict[str, Any]) -> dict[str, Any]:
 
 
 def scenario_of_estimates(scenario: Scenario) -> Scenario:
-    """Return a scenario whose nodes estimate the whole state, that of the blocks that all nodes of
-    ``scenario`` estimate; raises TheoryError if these are different ones.
+    """Return a scenario whose nodes estimate the whole state, that of the blocks of all nodes;
+    raises TheoryError if these are different ones.
     """
     if scenario.views is None:
         return scenario
@@ -49,9 +49,7 @@ def scenario_of_estimates(scenario: Scenario) -> Scenario:
 
 
 def _check_first_argument(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the public ``function`` with a check that its first argument is a Scenario, of which
-    it gets the last piece where that counts.
-    """
+    """Return ``function`` with a check that its first argument is a Scenario."""
 
     @wraps(function)
     def checked(scenario: Any, *args: Any, **kwargs: Any) -> Any:

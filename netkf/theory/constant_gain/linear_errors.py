@@ -69,9 +69,8 @@ class SampledNode(NamedTuple):
 
 
 def clock_jumps(scenario: Scenario) -> ClockJumps | DelayedJumps | SlotJumps:
-    """Return the errors of all nodes in continuous time as a linear system with jumps, for Poisson
-    clocks, or periodic ones that tick together: then from tick to tick. Raises TheoryError for
-    others, random delays, and delays beside bursts under Poisson clocks.
+    """Return the errors as a linear system with jumps, for Poisson clocks, or periodic ones from
+    tick to tick. Raises TheoryError for others, random delays, and delays beside bursts.
     """
     flow, samples, weights = _error_flow(scenario), _sampled_nodes(scenario), link_weights(scenario)
     clock = scenario.network.activation
@@ -149,9 +148,8 @@ def _from_tick_to_tick(
     directions: Directions,
     delay: float,
 ) -> SlotJumps:
-    """Return the system from one exchange to the next, for periodic clocks that tick together.
-    Without increments a predicted message has the error that the sender has at the arrival. Raises
-    TheoryError if clocks differ, or nodes have increments beside a delay.
+    """Return the system from exchange to exchange for periodic clocks that tick together. Without
+    increments a predicted message has the sender's error at arrival. Raises TheoryError.
     """
     _require_one_clock(clock, samples)
     N, n, _ = flow.drift.shape

@@ -77,9 +77,7 @@ def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
 
 
 def _bound_over_pieces(scenario: Scenario, times: FloatArray) -> FloatArray:
-    """Return the bound (T, N, n, n) of a plant that changes: each piece begins with the bound at
-    the end of the one before it.
-    """
+    """Return the bound (T, N, n, n) of a plant that changes, piece after piece."""
     edges, bounds = [0.0, *scenario.plant.changes.tolist(), math.inf], []
     cov: tuple[FloatArray, ...] | None = None
     for k, (start, end) in enumerate(itertools.pairwise(edges)):

@@ -224,9 +224,8 @@ def _is_symmetric(c: scipy.sparse.csr_array) -> bool:
 
 
 def left_weights(scenario: Scenario) -> FloatArray:
-    """Return the weights (N,) of the nodes' information for ever faster links: the left null vector
-    of ``D - c``, D the row sums of the coupling. Raises TheoryError if messages do not connect all
-    nodes.
+    """Return the left null vector (N,) of ``D - c``, weights of information for ever faster links;
+    raises TheoryError if messages do not connect all nodes.
     """
     algorithm = scenario.filter.algorithm
     if len(scenario.nodes) == 1:

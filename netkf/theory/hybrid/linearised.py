@@ -33,9 +33,8 @@ Rows = Callable[[FloatArray], FloatArray]
 def solve_map(
     linear: LinearisedRiccati, right: FloatArray, tolerance: float = RESIDUAL_TOLERANCE
 ) -> FloatArray:
-    """Return X (N, m) with ``linear(X) = -right``; nan if the map is singular. The residual is at
-    most ``tolerance`` times ``right`` (N, m), or rounding. Raises TheoryError for too many
-    unknowns.
+    """Return X (N, m) with ``linear(X) = -right`` to a relative ``tolerance``, nan if singular;
+    raises TheoryError for too many unknowns.
     """
     eliminates = right.size <= FEW_UNKNOWNS or linear.packed.eliminates_cheaply
     with np.errstate(all="ignore"):
@@ -55,9 +54,8 @@ def solve_map(
 
 
 def is_stable(linear: LinearisedRiccati) -> bool:
-    """Return True if all solutions of ``dX/dt = linear(X)`` vanish with time: as for any generator
-    of positive maps, if and only if the solution X for -I is positive definite. Raises TheoryError
-    for too many unknowns.
+    """Return True if solutions of ``dX/dt = linear(X)`` vanish, if and only if X for -I is positive
+    definite; raises TheoryError for too many unknowns.
     """
     packed = linear.packed
     P = packed.equations.start
@@ -118,9 +116,7 @@ def _solve_by_gmres(
 
 
 def _inverses(linear: LinearisedRiccati) -> tuple[Rows, Rows]:
-    """Return two inverses: that of rows (N, m) of nodes by themselves, and that of the mean of all
-    nodes for one row (m,); LinAlgError if there are none.
-    """
+    """Return inverses of rows (N, m) by themselves, and of the mean of nodes; or LinAlgError."""
     packed, n = linear.packed, linear.drifts.shape[1]
     if n <= MAX_PACKED:
         inverse, coarse = np.linalg.inv(linear.blocks), np.linalg.inv(linear.mean_map())

@@ -130,9 +130,7 @@ class PackedRiccati:
         return np.asarray(change)
 
     def series(self, Y: FloatArray, span: float, order: int) -> FloatArray:
-        """Return the Taylor coefficients (order + 1, N, m), in powers of seconds / ``span``, of the
-        solution through ``Y`` (N, m), without delays and samples.
-        """
+        """Return Taylor coefficients (order + 1, N, m) in seconds / ``span``, without delays."""
         series = np.empty((order + 1, *Y.shape))
         series[0] = Y
         # Coefficient k of P G P is the sum over i of (P_i G) P_k-i, one product of block matrices:

@@ -27,9 +27,8 @@ MAX_ENTRIES = 200  # entries of all covariances together
 
 
 def second_moment_rate(scenario: Scenario) -> float:
-    """Return the growth rate (1/s) of second moments of an upper bound on P; below 0 intervals for
-    the mean of P hold. Raises TheoryError except for Poisson clocks of links with independent
-    losses and no delay, without a steady bound, and for very large networks.
+    """Return the growth rate (1/s) of second moments of an upper bound on P: below 0 intervals for
+    the mean of P hold. Raises TheoryError but for Poisson clocks, independent losses, no delay.
     """
     channel = scenario.network.channel
     if not isinstance(scenario.network.activation, Poisson):
@@ -72,9 +71,7 @@ def second_moment_rate(scenario: Scenario) -> float:
 
 
 def _linear_recursion(scenario: Scenario, bound: FloatArray) -> ClockJumps:
-    """Return the recursion of the stacked vec(P_i) (N n n,) with the gains of ``bound`` (N, n, n):
-    a linear system with jumps, in which a message averages as it does estimates.
-    """
+    """Return the recursion of stacked vec(P_i) with the gains of ``bound``, a system with jumps."""
     eye, drifts = np.eye(scenario.plant.n), []
     for P, model in zip(bound, scenario.models, strict=True):
         # vec of d P_i / dt = (A - P G) P_i + P_i (A - P G)' between events.

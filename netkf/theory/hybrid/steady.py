@@ -66,12 +66,8 @@ def _steady_state_of(scenario: Scenario) -> FloatArray | None:
 
 
 def has_stabilising_gains(scenario: Scenario) -> bool:
-    """Return True if some gains stabilise H(12), the coupled Riccati equations that bound the mean
-    of each filter's P, which then have a steady state.
-
-    Takes about half the time of :func:`has_steady_state`, which computes that state and so also
-    finds plants with a mode that is neither driven nor damped. Raises TheoryError if H(12) does not
-    apply.
+    """Return True if some gains stabilise H(12), in half the time of :func:`has_steady_state`,
+    which also finds plants with a mode that is neither driven nor damped. Raises TheoryError.
     """
     return _stabilising_covariances(PackedRiccati(coupled_riccati(scenario)), None) is not None
 
@@ -87,9 +83,7 @@ def steady_by_node(scenario: Scenario) -> FloatArray:
 
 
 def steady_state(equations: CoupledRiccati, first: FloatArray | None = None) -> FloatArray | None:
-    """Return the steady state (N, n, n) of H(12), or None; searched for from ``first`` (N, n, n),
-    such as that for other rates. Raises TheoryError for a cycle.
-    """
+    """Return the steady state (N, n, n) of H(12), or None; TheoryError for a cycle."""
     packed = PackedRiccati(equations)
     P = _stabilising_covariances(packed, first)
     if P is None:
@@ -207,9 +201,7 @@ def _no_steady_state(scenario: Scenario, equations: CoupledRiccati) -> str:
 
 
 def threshold_factor(equations: CoupledRiccati) -> float | None:
-    """Return the least factor on all link rates for which H(12) has a steady state, to 1e-6, or
-    1e-3 for large networks; None if 1e6 does not suffice.
-    """
+    """Return the least factor on link rates with a steady state of H(12); None above 1e6."""
     low = _necessary_factor(equations)
     if low is None:
         return None

@@ -250,8 +250,7 @@ def _critical_bounds(F: FloatArray, H: FloatArray, search: _GainSearch) -> tuple
 
 def contraction_radius(F: FloatArray, arrivals: Sequence[tuple[float, FloatArray]]) -> float:
     """Return the least spectral radius over gains of ``X -> sum_s p_s (F + K_s H_s) X (F + K_s
-    H_s)'``, with ``arrivals`` (p_s, H_s) of sets of readings. Below 1 the mean of P stays bounded
-    (R (32), derived).
+    H_s)'``: below 1 the mean of P stays bounded (R (32), derived).
     """
     return _GainSearch(F, [H for _, H in arrivals]).best([p for p, _ in arrivals])[0]
 

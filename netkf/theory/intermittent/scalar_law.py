@@ -128,9 +128,8 @@ class ScalarLaw:
         return P
 
     def mean(self) -> float:
-        """Return the mean E of the invariant law to about 1e-9, infinite if (1-g) F^2 >= 1: E = g
-        E[f_1(X)] + (1-g)(F^2 E + Q), with E[f_1(X)] between two sums over compositions of 18 maps.
-        Raises TheoryError if these differ by more than 1e-6.
+        """Return the mean of the invariant law to about 1e-9, infinite if (1-g) F^2 >= 1, by two
+        sums over compositions of 18 maps; raises TheoryError if these differ by more than 1e-6.
         """
         growth = (1.0 - self.delivery) * self.F**2
         if not contracts(growth):

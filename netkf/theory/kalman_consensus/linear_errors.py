@@ -21,9 +21,8 @@ from netkf.theory.intermittent.riccati import steady_covariance
 
 
 def slot_jumps(scenario: Scenario) -> SlotJumps:
-    """Return the errors of Kalman-consensus filters in slots at steady gains as a linear system:
-    the exchange adds multiples of the differences of predictions. Raises TheoryError for recorded
-    exchanges, and if nodes share readings and messages can be lost.
+    """Return the errors of Kalman-consensus filters at steady gains as a linear system. Raises
+    TheoryError for recorded exchanges, and for shared readings with losses.
     """
     algorithm: Any = scenario.filter.algorithm
     nodes = scenario.nodes

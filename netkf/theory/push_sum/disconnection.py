@@ -48,9 +48,7 @@ class Probability(float):
     exact: bool
 
     def __new__(cls, value: float, low: float, high: float, exact: bool) -> Probability:
-        """Return ``value`` with its interval ``low`` .. ``high``; ``exact`` says that it was
-        computed, not estimated.
-        """
+        """Return ``value`` with its interval; ``exact``: computed, not estimated."""
         probability = super().__new__(cls, value)
         probability.low, probability.high, probability.exact = low, high, exact
         return probability

@@ -68,9 +68,8 @@ class EstimationSteps:
 
 
 def estimation_steps(scenario: Scenario, averaging: Averaging | None = None) -> EstimationSteps:
-    """Return how the push-sum filter's errors change in a slot at its asymptotic gains, with the
-    scenario's links or the given ``averaging``. Raises TheoryError without such gains, for another
-    F than the plant's, and for links that are not drawn independently.
+    """Return how errors of push-sum change in a slot at asymptotic gains. Raises TheoryError
+    without such gains, for another F than the plant's, and for dependent links.
     """
     limits = push_sum_limits(scenario)
     F, _ = scenario.slot_belief
@@ -87,9 +86,8 @@ def estimation_steps(scenario: Scenario, averaging: Averaging | None = None) -> 
 
 
 def averaging_law(scenario: Scenario, delivery: float | None = None) -> Averaging:
-    """Return the law of the averaging steps with the links of the channel, or one ``delivery``
-    probability. Raises TheoryError for recorded links, losses that depend on the past, and delays
-    by which messages can be late.
+    """Return the law of averaging steps with the channel's links, or one ``delivery``. Raises
+    TheoryError for recorded links, dependent losses, and late messages.
     """
     algorithm, topology = push_sum_filter(scenario), scenario.topology
     channel = scenario.network.channel

@@ -27,9 +27,8 @@ MAX_NEIGHBOURS = 10
 
 
 def tracks_in_slots(scenario: Scenario) -> tuple[float, FloatArray]:
-    """Return the largest spectral radius of ``C F (x) C F`` of a track, C = I - K H, and the exact
-    steady covariances (N, n, n) of what nodes show, over noises and losses. Raises TheoryError
-    where a track has no steady state or losses have no law.
+    """Return the largest spectral radius of ``C F (x) C F``, C = I - K H, and the steady
+    covariances (N, n, n) of what nodes show. Raises TheoryError.
     """
     if not isinstance(scenario.network.activation, Broadcast):
         raise TheoryError("the exchanges are recorded: one outcome, not a law")
