@@ -170,10 +170,11 @@ class Workspace:
         self._scratch: tuple[Scratch, FlowScratch] | None = None
         kernels = compiled_kernels(scenario.node_filter, clocked=True)
         assert kernels is not None
-        self._unrolled = kernels.unrolled and scenario.views is None and scenario.plant.linear
         self.clocked: ClockFilters | None = None
         if not is_immediate(scenario):
             self.clocked = ClockFilters(scenario, kernels, self._start, FIRST_MESSAGES)
+        # The event loop is compiled once for all n: its verbs alone have loops over the states.
+        self._unrolled = kernels.unrolled and self.clocked is None
 
     @property
     def filters(self) -> Filters:
