@@ -112,6 +112,7 @@ def test_public_names_exist():
         _ = netkf.nothing
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 def test_an_interrupted_run_leaves_what_was_finished(tmp_path, name):
     out = tmp_path / "out"

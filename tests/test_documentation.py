@@ -15,7 +15,11 @@ ELSEWHERE = {  # pages whose blocks have tests of their own
     "scenario_files.md": "test_docs.py",
 }
 NEEDS = {"formats.md": ("xarray", "h5netcdf", "stonesoup", "filterpy")}
-SLOW = ("blocks.md", "faults.md", "gallery.md", "look.md", "sizing.md")  # others run their scripts
+# Tests of other files run their scripts and commands.
+SLOW = (
+    *("blocks.md", "faults.md", "gallery.md", "look.md", "packet_log.md", "sizing.md"),
+    "writing_filters.md",
+)
 FOLLOWED = [page for page in PAGES if page.name not in ELSEWHERE and blocks(page)]
 
 

@@ -23,7 +23,7 @@ def names():
     return found
 
 
-@pytest.mark.one_in(8)
+@pytest.mark.one_in(12)
 @pytest.mark.parametrize(
     ("paper", "title", "text", "code", "printed"), ENTRIES, ids=[f"{e[0]}-{e[1]}" for e in ENTRIES]
 )

@@ -25,7 +25,7 @@ def full(*_, **__):
     raise OSError(28, "No space left on device")
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("name", list(COMMANDS))
 def test_a_picture_that_cannot_be_written_is_a_note(name, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("matplotlib.backends.backend_agg.FigureCanvasAgg.print_png", full)
@@ -39,6 +39,7 @@ def test_a_picture_that_cannot_be_written_is_a_note(name, tmp_path, capsys, monk
     assert not [file for file in out.iterdir() if file.suffix in (".png", ".part")]
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(
     ("name", "writer"),
     [

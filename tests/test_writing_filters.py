@@ -102,6 +102,7 @@ def test_a_class_that_changes_nothing_is_compiled_and_one_that_changes_a_method_
     np.testing.assert_allclose(runs["derived:Deaf"].P, runs["local"].P, rtol=0, atol=1e-10)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("activation", ACTIVATIONS, ids=["nodes", "directions", "readings"])
 def test_consensus_brings_blind_nodes_to_the_truth(folder, activation):
     """Node 3 and 5 see nothing: what they know they heard."""

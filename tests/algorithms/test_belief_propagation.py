@@ -76,6 +76,7 @@ def expected_states(scenario, run, steps, keeps):
     return np.stack([x for x, _ in states]), np.stack([P for _, P in states])
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("memory", ["slot", "all"])
 @pytest.mark.parametrize("graph", [TREE, RING["graph"]], ids=["tree", "ring"])
 def test_the_textbook(graph, memory, tmp_path):
@@ -101,7 +102,7 @@ def test_as_many_steps_as_the_tree_is_wide_are_the_central_filter(tmp_path):
     assert (size < right - 1e-3).all()
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("memory", ["slot", "all"])
 @pytest.mark.parametrize("graph", [TREE, RING["graph"]], ids=["tree", "ring"])
 def test_theory_follows_it_and_on_trees_p_is_the_covariance(graph, memory, tmp_path):
@@ -276,6 +277,7 @@ def test_evidence_is_kept_for_a_thousand_slots(name, tmp_path):
     close(error_law(scenario, run).P / size, run.P / size, 1e-9)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("rates", [(-0.02, -6.0), (0.05, -6.0)])
 def test_evidence_is_kept_under_clocks(rates, tmp_path):
     """Samples, losses and late messages over 60 time constants of the plant."""

@@ -129,6 +129,7 @@ def test_on_trees_it_is_the_posterior_of_what_has_arrived(
     assert run.count("lost") > 10
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("text", [ROBOTS, CLOCKED], ids=["slots", "clocks"])
 def test_p_is_right_where_nodes_forget_and_too_small_on_loops(tmp_path: Path, text: str) -> None:
     short = BELIEF | {"estimates": "own", "window": 2}

@@ -16,6 +16,7 @@ from scipy.stats import chi2
 
 import netkf
 from netkf.scenario.writing import as_table, to_toml
+from tests.conftest import with_slow
 
 RULES = ["split", "ci", "naive"]
 ROBOTS = """
@@ -179,8 +180,8 @@ BLOCK_FILTERS = {
 """Settings of filters of blocks, changes of a scenario, and how P is to that of all blocks."""
 
 
-@pytest.mark.one_in(7)
-@pytest.mark.parametrize("name", BLOCK_FILTERS)
+@pytest.mark.one_in(10)
+@pytest.mark.parametrize("name", with_slow(BLOCK_FILTERS, {"cross-covariances of two"}))
 @pytest.mark.parametrize("text", [ROBOTS, CLOCKED], ids=["slots", "clocks"])
 def test_no_block_filter_is_below_the_stacked_kalman_filter(
     tmp_path: Path, name: str, text: str
@@ -207,7 +208,7 @@ def test_no_block_filter_is_below_the_stacked_kalman_filter(
     assert (difference < 1e-9) == equal
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("estimates", ["own", "own+neighbours"])
 def test_only_the_naive_update_is_overconfident(tmp_path: Path, estimates: str) -> None:
     # Where covariances are split, runs take much longer; a P like the naive one is found by twelve.

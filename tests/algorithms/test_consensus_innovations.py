@@ -145,6 +145,7 @@ def test_the_textbook(lossy, tmp_path):
         np.testing.assert_allclose(run.xhat, xhat, rtol=digits, atol=digits)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("lossy", [False, True])
 def test_theory_follows_it_and_p_is_the_covariance_without_losses(lossy, tmp_path):
     more = {"horizon": 4.0, "probe": [0.0, 1.0, 2.0, 3.0]} | ({} if lossy else {"network": SURE})

@@ -42,6 +42,7 @@ def plain_slots(scenario, run):
     return np.stack([x for x, _ in found]), np.stack([P for _, P in found])
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("engine", ["simpy", "compiled"])
 def test_the_equations_in_slots(engine, tmp_path):
     for seed in range(3):

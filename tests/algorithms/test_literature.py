@@ -157,7 +157,7 @@ def test_the_textbook(name, engine, tmp_path):
             np.testing.assert_allclose(run.xhat, xhat, rtol=1e-10, atol=1e-10)
 
 
-@pytest.mark.one_in(4)
+@pytest.mark.one_in(12)
 @pytest.mark.parametrize("name", FILTERS)
 def test_both_engines_make_the_same_run_and_theory_follows_it(name, tmp_path):
     """Exact covariances of the errors against the engine's own linear map."""
@@ -296,6 +296,7 @@ def clocked(algorithm, folder, activation, sampling, **more):
     return scenario_of(algorithm, folder, **{**settings, **more})
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("channel", [{}, {"delay": {"kind": "constant", "seconds": 0.3}, **LOSSY}])
 @pytest.mark.parametrize("at", ["links", "nodes"])
 def test_consensus_on_information_under_clocks_is_covariance_intersection(at, channel, tmp_path):

@@ -235,7 +235,7 @@ def test_errors_of_many_runs_are_within_the_bounds(tmp_path: Path) -> None:
     assert (ensemble.mean_nees[-1] > 0.4 * n).all()
 
 
-@pytest.mark.one_in(4)
+@pytest.mark.one_in(8)
 @pytest.mark.parametrize("text", [AREAS, clocked(AREAS)], ids=["slots", "clocks"])
 @pytest.mark.parametrize("estimates", ["own", "own+neighbours"])
 @pytest.mark.parametrize("seconds", [0.0, 0.3])

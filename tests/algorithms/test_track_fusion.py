@@ -90,7 +90,7 @@ def expected_states(scenario, run, kind, minimise):
     return np.stack([x for x, _ in found]), np.stack([P for _, P in found])
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(("kind", "minimise"), PAIRS)
 def test_the_textbook(kind, minimise, tmp_path):
     for n in (1, 2, 4):
@@ -104,7 +104,7 @@ def test_the_textbook(kind, minimise, tmp_path):
             np.testing.assert_allclose(run.xhat, xhat, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("kind", [BEST, INVERSE, CROSS])
+@pytest.mark.parametrize("kind", [BEST, INVERSE, pytest.param(CROSS, marks=pytest.mark.slow)])
 def test_both_engines_make_the_same_run_and_theory_follows_it(kind, tmp_path):
     settings = {"horizon": 4.0, "probe": [0.0, 1.0, 2.0, 3.0]}
     scenario = scenario_of({"kind": "track-fusion", "rule": kind}, tmp_path, 1, **settings)
@@ -321,6 +321,7 @@ def test_inverse_intersection_is_surer_and_right_in_a_network(tmp_path):
         assert np.linalg.eigvalsh(gap)[..., 0].min() > -1e-12
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("at", ["links", "nodes"])
 def test_under_clocks(at, tmp_path):
     """Delayed and lost messages: P is at least the exact covariance."""

@@ -326,6 +326,7 @@ def test_wrong_settings_are_refused_by_their_key(table, key, tmp_path):
     assert str(refused.value).startswith(key)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(
     "table", [STOCHASTIC, EVENT, wrapped({"kind": "track-fusion", "rule": "ici"}, [[2.0]])]
 )

@@ -131,6 +131,7 @@ def rare_losses(random, q, windows, links, sent):
     return lost - counts * q, counts * (q * (1.0 - q))
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(("q", "windows", "sent"), [(2e-3, 160, 5), (5e-4, 4000, 1), (0.3, 160, 5)])
 def test_rare_losses_of_links_are_not_taken_for_correlated(q, windows, sent):
     random, level, accused, values = np.random.default_rng(5), 0.05, 0, []
@@ -234,6 +235,7 @@ class Alternating(Bernoulli):
         return 0.5
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(
     ("kind", "reason"),
     [("Unknown", "state no probability"), ("Alternating", "different probabilities")],

@@ -127,7 +127,7 @@ def few_laws(monkeypatch):
     monkeypatch.setattr(exact, "MAX_REPLAYED", 20)
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.usefixtures("few_laws")
 @pytest.mark.parametrize(
     ("F", "R", "cov", "delivery", "horizon"),
@@ -173,6 +173,7 @@ def test_mean_squares_are_held_to_those_of_their_own_time(tmp_path):
         assert not broken_rows(scenario_of(PUSH_SUM, tmp_path, **wide, horizon=horizon))
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("size", [1e6, 1e9])
 def test_rounding_of_a_large_covariance_is_no_breach(size, tmp_path):
     cov = [[size, 0.0], [0.0, size]]
@@ -278,13 +279,14 @@ def test_directions_without_any_error_are_not_judged(table, driven, tmp_path):
     assert not broken_rows(from_table({**table, "plant": plant}, tmp_path), runs=12)
 
 
-@pytest.mark.one_in(3)
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("scenario_number", range(6))
 def test_scenarios_drawn_at_random_are_not_accused(scenario_number, tmp_path):
     """One for each filter; the same for hundreds in ``python -m tests.checks.calibration``."""
     assert not accusations(draw_scenario(scenario_number, tmp_path), 12, 0, levels=(0.01,))
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(
     "number", [16, 43, 155, *(pytest.param(k, marks=pytest.mark.slow) for k in (20, 202, 260))]
 )
@@ -295,6 +297,7 @@ def test_scenarios_of_all_kinds_are_not_accused(number, tmp_path):
     assert not accusations(draw_any(number, tmp_path), 10, 0, levels=(0.01,))
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(("table", "slots"), [(GOSSIP, 2.0), (DIFFUSION, 3.0), (PUSH_SUM, 3.0)])
 def test_a_few_slots_are_enough_to_be_judged(table, slots, tmp_path):
     """Limits that they do not reach are undecided; less than two slots to look at are refused."""
@@ -365,7 +368,7 @@ OWN_PARTS = {
 }  # fmt: skip
 
 
-@pytest.mark.one_in(3)
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("name", OWN_PARTS)
 def test_parts_are_held_to_what_they_state(name, tmp_path):
     table, changes = OWN_PARTS[name]
@@ -394,7 +397,7 @@ SHORT = {
 }
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", SHORT)
 def test_parts_that_show_little_are_not_accused(name, tmp_path):
     table, changes = SHORT[name]

@@ -54,6 +54,7 @@ def test_weights_that_change_nothing_hold(tmp_path):
     assert own_attributes(SameWeights(epsilon=0.3)) == ["link_weights"]
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(("name", "own"), [("LateSwaps", "timing"), ("SwapsOnlyX", "absorb")])
 def test_what_should_be_the_same_and_is_not_is_broken(name, own, tmp_path):
     verdict, row = beside(GOSSIP, name, tmp_path)

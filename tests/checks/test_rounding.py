@@ -47,7 +47,7 @@ def test_no_promise_is_broken_by_rounding(unstable):
     assert found, [row for row in found.rows if row.verdict == "broken"]
 
 
-@pytest.mark.one_in(3)
+@pytest.mark.slow
 def test_no_filter_is_inconsistent_by_rounding(unstable):
     found = netkf.consistency(unstable, 10, confidence=0.999, workers=1)
     assert found, found.rows

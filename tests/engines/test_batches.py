@@ -11,6 +11,7 @@ from netkf.trace.schema import KINDS
 from tests.conftest import scenario_files, with_slow
 
 SHORT = {"delayed_links": 6.0, "intel_lab": 240.0, "intel_lab_radio": 240.0, "push_sum_planar": 3.0}
+LONG = {"diffusion_regression", "intel_lab_radio", "ulb_library"}
 FILES = {file.stem: file for file in scenario_files()}
 UNSTABLE = {"kind": "diffusion", "A": [[2.0]], "B": [[1.0]], "cov": [[1.0]]}
 BURSTS = {"mean_loss": 0.3, "mean_burst": 3.0}
@@ -75,7 +76,7 @@ def test_a_batch_of_one_where_memory_is_short(ring, monkeypatch):
 
 
 @pytest.mark.one_in(4)
-@pytest.mark.parametrize("name", with_slow(FILES, ("diffusion_regression", "ulb_library")))
+@pytest.mark.parametrize("name", with_slow(FILES, LONG))
 def test_compiled_batches_hold_the_runs_of_the_scenarios(name):
     scenario = netkf.load(FILES[name])
     horizon = min(scenario.horizon, SHORT.get(name, scenario.horizon))

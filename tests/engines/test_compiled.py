@@ -87,7 +87,7 @@ def test_slots_made_together_agree(monkeypatch, name, rows):
     assert_agree(scenario.replace({"horizon": 12.0 * scenario.slot_plant.period, **changes}))
 
 
-@pytest.mark.one_in(5)
+@pytest.mark.one_in(10)
 @pytest.mark.parametrize(
     ("stop", "tolerance", "links"),
     [

@@ -94,6 +94,7 @@ def test_frames_change_no_error(kind, mixed, monkeypatch):
     np.testing.assert_allclose(run.xhat, plain.xhat, rtol=1e-9, atol=1e-6)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("kind", ["covariance-intersection", "push-sum"])
 def test_frames_move_messages_beside_modes_that_decay_fast(kind):
     """An offset pulled back over a delay must not grow with a mode that nobody misses."""
@@ -123,7 +124,7 @@ def test_errors_so_large_that_they_round_each_other_are_known():
     assert (4e-16 * np.abs(run.error[early]).max() < np.sqrt(least)).all()
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("kind", ["intermittent", "diffusion", "central"])
 def test_errors_keep_their_size_however_far_the_plant_goes(kind):
     run = netkf.simulate(scenario(kind, SENSORS, horizon=300.0), engine="simpy")

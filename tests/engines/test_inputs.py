@@ -360,7 +360,7 @@ class Louder(Local):
         return 2.0 * state.xhat, state.P
 
 
-@pytest.mark.one_in(5)
+@pytest.mark.one_in(10)
 @pytest.mark.parametrize("model", [None, {"R": [[0.1]]}])
 @pytest.mark.parametrize("plant", ["slots", "samples", "increments", "ekf", "ukf"])
 def test_a_filter_that_does_not_move_is_told_by_its_model(plant, model):

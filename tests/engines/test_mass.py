@@ -45,6 +45,7 @@ def scenario(rounds, loss, delay, **more):
     return from_table({**table, **more}, Path())
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(
     ("engine", "rounds"),
     [

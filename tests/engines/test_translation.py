@@ -116,7 +116,7 @@ def test_the_consensus_filter_of_the_page_speaks_of_common_blocks(
     assert run.count("send") == (0 if estimates == "own" else 6 * 4)
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("estimates", ["named", "own+neighbours"])
 @pytest.mark.parametrize("clocks", [False, True])
 def test_compiled_code_translates_as_python_does(

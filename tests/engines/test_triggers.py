@@ -79,7 +79,7 @@ LONG = ("belief-propagation", "cross-covariance", "hcmci", "consensus")
 """Inner filters that take long to compile, and are compiled without a trigger anyway."""
 
 
-@pytest.mark.one_in(4)
+@pytest.mark.one_in(8)
 @pytest.mark.parametrize("name", with_slow(INNER, LONG))
 def test_both_engines_send_the_same(name, tmp_path):
     """Node 2 has two sensors, node 4 none."""
@@ -101,7 +101,7 @@ def test_both_engines_send_the_same(name, tmp_path):
             assert_batch(scenario)
 
 
-@pytest.mark.one_in(4)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["intermittent", "hcmci", "diffusion", "consensus"])
 def test_links_of_one_direction(name, tmp_path):
     """Node 3 hears nobody, and nobody hears node 4."""
@@ -111,7 +111,7 @@ def test_links_of_one_direction(name, tmp_path):
     assert_batch(scenario)
 
 
-@pytest.mark.one_in(5)
+@pytest.mark.one_in(8)
 @pytest.mark.parametrize("name", with_slow(INNER, {"belief-propagation", "cross-covariance"}))
 def test_frames_of_unstable_plants(name, tmp_path):
     """The origin moves, and with it everything that a trigger keeps."""
@@ -131,6 +131,7 @@ def test_frames_of_unstable_plants(name, tmp_path):
 MATRIX = [[2.0, 0.5], [0.5, 1.0]]
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("inner", ["intermittent", "kcf", "push-sum"])
 def test_triggers_that_are_matrices(inner, tmp_path):
     sensors = [
@@ -150,6 +151,7 @@ def test_triggers_that_are_matrices(inner, tmp_path):
     assert_batch(scenario)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", ["hcmci", "gossip"])
 def test_readings_that_are_missing(name, tmp_path):
     """Recorded sensors without rows for some slots, on node 2 beside one that always reads."""

@@ -75,6 +75,7 @@ def kalman_bucy(A, B, H, seconds):
     return X[:n] @ np.linalg.inv(X[n:])
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("kind", ["rotation", "integrators"])
 def test_both_engines_run_plants_without_damping(kind):
     random = np.random.default_rng(7)
@@ -102,6 +103,7 @@ def test_growth_that_the_horizon_is_too_short_for_needs_no_frame():
         assert (run.status, run.exact_errors) == ("complete", False)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("kind", ["rotation", "integrators"])
 def test_theory_of_plants_without_damping_does_not_depend_on_a_bit(kind):
     random = np.random.default_rng(8)

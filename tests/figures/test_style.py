@@ -79,6 +79,7 @@ def test_categorical_series_differ_by_more_than_colour():
         assert str(one.dashes) != str(other.dashes)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("kind", with_slow(["ring", "ensemble", "slots", "no truth"], {"no truth"}))
 def test_no_two_series_of_a_figure_look_alike(results, kind):
     drawing = FigureSet(results(kind))

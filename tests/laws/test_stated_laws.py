@@ -121,6 +121,7 @@ def scenario(name, settings):
     return from_table(with_network(TICKS, activation=part))
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", with_slow(PARTS, {"chain"}))
 def test_a_law_of_ones_own_is_tested(name):
     checker, cls, wrong, words, promise = PARTS[name]

@@ -127,6 +127,7 @@ def test_slow_changes_are_found():
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_slow_changes_are_neither_bursts_nor_shared_fate():
     """Few true assumptions are rejected; without windows most would be."""
     flags, without = [], []

@@ -34,6 +34,7 @@ def log(tmp_path):
     return folder
 
 
+@pytest.mark.slow
 def test_every_number_is_that_of_the_log(log, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["import", str(log), "--kind", "mrclam", "--out", str(out)]) == 0

@@ -271,7 +271,7 @@ RUNS = {
 }
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("name", RUNS)
 def test_a_run_written_as_a_log_comes_back_to_the_bit(name, tmp_path):
     """Events and states, in slots and under clocks of links, nodes, directions and readings, with

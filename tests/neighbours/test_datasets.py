@@ -68,6 +68,7 @@ def test_an_ensemble_and_its_directory(tmp_path, capsys):
     assert "must be a run with its events" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_blocks_have_names_and_owners():
     scenario = netkf.load(SCENARIOS / "blocks" / "cooperative_localisation.toml", {"horizon": 2.0})
     run = netkf.simulate(scenario, engine="simpy")

@@ -31,6 +31,7 @@ def test_bernoulli():
     assert not sampled_outcomes(50, loss=losses.Bernoulli(0.0))[0].any()
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(
     "loss",
     [

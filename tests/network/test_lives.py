@@ -365,7 +365,7 @@ def assert_accounts_balance(log, horizon):
     assert all(sent_at[key] > horizon - 5.0 for key in under_way)
 
 
-@pytest.mark.one_in(5)
+@pytest.mark.one_in(10)
 @pytest.mark.parametrize("slots", [True, False])
 @pytest.mark.parametrize(
     "filter_", ["hybrid", "constant-gain", "push-sum", "intermittent", "hcmci"]
@@ -490,6 +490,7 @@ def test_no_lives_is_todays_run(scenario_of):
     assert prints[0] == prints[1]
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("memory", ["kept", "lost"])
 def test_check_holds_a_run_to_the_promises_that_survive(scenario_of, memory):
     scenario = scenario_of(CLOCKS, *recorded(memory), filter_="hybrid")

@@ -329,6 +329,7 @@ def test_sensors_of_blocks_need_blocks(tmp_path: Path) -> None:
         load(text, tmp_path)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("engine", ["simpy", "compiled"])
 def test_each_block_has_its_own_input(tmp_path: Path, engine: str) -> None:
     (tmp_path / "u.csv").write_text("t,u0\n0.5,2\n3,-1\n")
@@ -392,6 +393,7 @@ def arc(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return x + np.array([dx, dy, w]), np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("engine", ["simpy", "compiled"])
 def test_blocks_need_not_be_linear(tmp_path: Path, engine: str) -> None:
     (tmp_path / "sights.csv").write_text("t,node,to,y0,y1\n1,1,2,4.9,0.5\n2,1,2,4.8,0.4\n")

@@ -163,6 +163,7 @@ def test_nodes_that_estimate_their_own_block_have_its_filter(scenario):
         np.testing.assert_allclose(own.P, whole.P[:, 0, entries, entries], atol=1e-12)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(
     "kind",
     with_slow(

@@ -189,6 +189,7 @@ def test_unicycle_with_ranges_and_bearings_is_a_plain_ekf(pair, engine):
         np.testing.assert_allclose(central.P[k, 0], P, atol=1e-10)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("kind", ["hcmci", "intermittent"])
 def test_networks_of_filters_are_the_same_in_both_engines(pair, kind):
     scenario, _ = pair
@@ -364,6 +365,7 @@ LINEAR = {
 }
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_linear_f_is_the_linear_plant(custom, engine):
     """To the bit with the extended Kalman filter, else to rounding; both engines call Python."""
@@ -467,6 +469,7 @@ def test_inputs_fit_the_motion(custom, plant, words):
     assert words in str(caught.value)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("engine", ENGINES)
 def test_an_error_of_a_users_f_names_its_line(custom, engine):
     scenario = netkf.load(custom, {"plant.f": "swings:Late"})

@@ -263,6 +263,7 @@ def test_each_block_is_drawn_recorded_or_unknown_by_itself(tmp_path, slots):
         from_table(table, tmp_path)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("slots", [True, False])
 def test_blocks_that_are_drawn_are_judged_and_others_named(tmp_path, slots):
     table = mixed(tmp_path, slots)

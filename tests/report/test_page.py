@@ -6,6 +6,7 @@ import json
 import re
 import shlex
 import shutil
+from functools import cache
 from types import SimpleNamespace
 
 import matplotlib
@@ -41,16 +42,24 @@ from tests.report.conftest import EVIL, write_verdict
 from tests.report.decoding import Page
 from tests.report.oracle import plain_messages
 
+LATER = ("delayed", "library")
+
+
+@cache
+def page_of(*directories):
+    """The page of results that no test changes, made once."""
+    return Page(make_page([*directories]))
+
 
 def findings_of(directory):
     source = read_source(directory)
     return describe_source(source, join_messages(source.run.log))
 
 
-@pytest.mark.parametrize("name", with_slow(["ring", "delayed", "slots", "library"], {"library"}))
+@pytest.mark.parametrize("name", with_slow(["ring", "slots", *LATER], LATER))
 def test_a_page_holds_every_number_of_its_run(name, request):
     directory = request.getfixturevalue(name)
-    page, run = Page(make_page([directory])), netkf.open(directory)
+    page, run = page_of(directory), netkf.open(directory)
     data = page.data["runs"][0]
     columns = {key: page.column(c) for key, c in data["samples"]["columns"].items()}
     i, j = np.triu_indices(run.x.shape[1])
@@ -85,7 +94,7 @@ def test_a_page_holds_every_number_of_its_run(name, request):
 
 def test_nothing_comes_from_outside(ring, ensembles):
     for directories in ([ring], ensembles):
-        page = Page(make_page(directories))
+        page = page_of(*directories)
         for tag, attrs in page.elements:
             assert not {"src", "action", "style", "onclick", "onload"} & set(attrs), tag
             assert attrs.get("href", "#").startswith(("#", "data:,"))
@@ -134,7 +143,7 @@ def test_data_cannot_end_their_element(value):
 def test_tables_show_the_numbers_of_the_command_line(ring, ensembles):
     for directory in (ring, ensembles[0]):
         source = read_source(directory)
-        shown = Page(make_page([directory])).shown
+        shown = page_of(directory).shown
         for line in summary_table(source.summary).splitlines()[2 : 2 + len(source.run.nodes)]:
             assert " ".join(line.split()) in shown
 
@@ -184,7 +193,7 @@ def test_a_node_that_hardly_hears_anybody_is_said_to_be_one(library, ring):
 
 @pytest.mark.slow
 def test_lists_that_are_cut_say_how_many_are_left_out(library):
-    told = Page(make_page([library])).shown
+    told = page_of(library).shown
     run = netkf.open(library)
     others = len(run.nodes) - 1 - 4
     assert f"never heard node 1, 2, 3, 4 and {others} others" in told
@@ -240,7 +249,7 @@ def test_errors_of_the_start_up_are_called_so(tmp_path):
 
 
 def test_the_table_of_replays_has_the_changes_of_the_command_line(ring):
-    page, found = Page(make_page([ring])), explain_worst(read_source(ring))
+    page, found = page_of(ring), explain_worst(read_source(ring))
     was, best = found.what_ifs[0].trace, found.what_ifs[-1].trace
     assert f"{best:.4g} {100 * (best / was - 1):+.1f} %" in page.shown
     limit = f"{1.05 * best:.4g}, 1.05 times that with no message missing"
@@ -252,7 +261,7 @@ def test_the_table_of_replays_has_the_changes_of_the_command_line(ring):
 def test_the_price_of_the_network_is_the_centralised_filter_on_the_same_truth(name, request):
     """By a run of that filter from the command line's table, at the sample that is explained."""
     directory = request.getfixturevalue(name)
-    source, page = read_source(directory), Page(make_page([directory]))
+    source, page = read_source(directory), page_of(directory)
     run, at = netkf.open(directory), source.worst.explained.time
     other = netkf.simulate(
         netkf.load(directory / "scenario.toml").replace({"filter": {"kind": "central"}}),
@@ -266,7 +275,7 @@ def test_the_price_of_the_network_is_the_centralised_filter_on_the_same_truth(na
 
 
 def test_what_the_limit_of_the_bound_is_stands_below_the_averages(ring):
-    shown = Page(make_page([ring])).shown
+    shown = page_of(ring).shown
     assert "what the bound of every node tends to as links tick ever faster" in shown
     assert "with 1/N of the information of all N nodes' readings" in shown
 
@@ -364,11 +373,11 @@ def test_samples_of_large_networks_are_thinned_although_each_node_has_its_worst_
         assert {0, int(worst), 77, times - 1} <= {*kept.tolist()}
 
 
-@pytest.mark.parametrize("name", ["library", "slots"])
+@pytest.mark.parametrize("name", with_slow(["library", "slots"], {"library"}))
 def test_innovations_are_those_of_the_run(name, request):
     """With and without truth; means and their intervals again with scipy."""
     directory = request.getfixturevalue(name)
-    page, run = Page(make_page([directory])), netkf.open(directory)
+    page, run = page_of(directory), netkf.open(directory)
     shown, found = page.data["runs"][0]["innovations"], compute_innovations(run)
     columns = {key: page.column(c) for key, c in shown["columns"].items()}
     assert shown["step"] == 1
@@ -388,7 +397,7 @@ def test_innovations_are_those_of_the_run(name, request):
 
 
 def test_what_stands_against_innovations_is_said(ring, slots, monkeypatch):
-    shown = Page(make_page([ring])).shown
+    shown = page_of(ring).shown
     assert "increments between two events of a node, the squared innovation" in shown
     monkeypatch.setattr("netkf.report.innovations.MAX_EVENTS", 10)
     shown = Page(make_page([slots])).shown
@@ -396,7 +405,7 @@ def test_what_stands_against_innovations_is_said(ring, slots, monkeypatch):
 
 
 def test_two_runs_show_their_differences(ensembles):
-    page = Page(make_page(ensembles))
+    page = page_of(*ensembles)
     comparison = netkf.compare(ensembles)
     certain = [row for row in comparison.rows if row.entries[1].real]
     assert certain
@@ -581,7 +590,7 @@ def test_every_kind_of_directory_has_a_page(ring, ensembles, sweep, tmp_path):
     table = pd.read_parquet(sweep / "sweep.parquet")
     assert f"RMS error {table['worst_rms'].min():.4g}" in shown
     assert "--trace full" in shown
-    page = Page(make_page([ensembles[0]]))
+    page = page_of(ensembles[0])
     np.testing.assert_array_equal(
         page.data["ensembles"][0]["times"], netkf.open(ensembles[0]).times
     )
@@ -685,14 +694,14 @@ def test_the_command(ring, tmp_path, capsys):
     assert main(["report", str(ring), str(ring), str(ring)]) == 2
 
 
-def test_only_pages_are_overwritten(ring, tmp_path, capsys):
+def test_only_pages_are_overwritten(slots, tmp_path, capsys):
     page, notes = tmp_path / "html", tmp_path / "notes.html"
     for _ in range(2):  # a page may be made again
-        assert main(["report", str(ring), "--out", str(page)]) == 0
+        assert main(["report", str(slots), "--out", str(page)]) == 0
     notes.write_text("<!DOCTYPE html>\n<title>netkf: my notes</title>\n")
     kept = notes.read_bytes()
     capsys.readouterr()
-    assert main(["report", str(ring), "--out", str(notes)]) == 2
+    assert main(["report", str(slots), "--out", str(notes)]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert "not a page of netkf report" in said

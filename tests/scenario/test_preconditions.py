@@ -183,7 +183,7 @@ def is_refused(name, case):
     return wrapped(name) in ONLY_CLOCKS | REFUSED.get(case, set())
 
 
-@pytest.mark.one_in(4)
+@pytest.mark.one_in(12)
 @pytest.mark.parametrize("case", CASES)
 def test_every_filter_is_refused_in_one_line_or_runs(case, tmp_path):
     for name, table in ALL.items():
@@ -210,7 +210,7 @@ LINEAR = ["all is there", "missing rows", "columns phi", "columns phi, missing r
           "a directed graph", "a singular cov", "one node"]  # fmt: skip
 
 
-@pytest.mark.one_in(3)
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("case", LINEAR)
 def test_P_is_the_covariance_of_the_error(case, tmp_path):
     one = CASES[case]
@@ -268,7 +268,7 @@ def test_filters_of_own_blocks_refuse_one_plant_for_all_nodes(kind, tmp_path):
         CASES["all is there"].scenario({"kind": kind}, tmp_path)
 
 
-@pytest.mark.one_in(3)
+@pytest.mark.one_in(9)
 @pytest.mark.parametrize("case", CONTINUOUS)
 def test_every_filter_under_clocks_is_refused_in_one_line_or_runs(case, tmp_path):
     lines = ["t,node,y0,phi0,phi1", *(f"{0.3 * k},{k % 3},0.5,1.0,{k}" for k in range(1, 9))]

@@ -61,6 +61,7 @@ def test_a_mismatched_model_is_as_bad_as_theory_says(gossip):
     assert all("the filters' model makes P overconfident" in row.verdict for row in found.rows)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("time", ["slots", "clocks"])
 def test_filters_that_start_elsewhere_have_the_errors_of_that(time, gossip, ring):
     if time == "slots":

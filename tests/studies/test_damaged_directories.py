@@ -238,6 +238,7 @@ def assert_one_line(capsys, *arguments):
     assert len(capsys.readouterr().err.splitlines()) == 1, arguments
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("kind", WRONG)
 def test_wrong_types_in_documents_with_right_digests_are_one_line(kinds, tmp_path, capsys, kind):
     folder = shutil.copytree(kinds / kind, tmp_path / "copy")

@@ -120,7 +120,7 @@ class Scipy:
         self.special = special
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("special", [OneSided, Normal])
 @pytest.mark.parametrize(
     ("module", "name"), [(filter_values, "compare_filters"), (targets, "size")]
@@ -130,6 +130,7 @@ def test_a_wrong_quantile_is_found(module, name, special, monkeypatch):
     assert {found.split()[0] for found, _ in wrong_sides(1500)} == {name}
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("freedom", [1, 3, 20])
 def test_few_runs_of_skewed_nees_accuse_nobody(freedom):
     """NEES of ten runs, each a mean of so many squares, of eighteen blocks judged at 99 %."""

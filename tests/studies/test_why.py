@@ -311,7 +311,7 @@ CHANNELS = {
 }
 
 
-@pytest.mark.one_in(4)
+@pytest.mark.one_in(12)
 @pytest.mark.parametrize("channel", CHANNELS)
 @pytest.mark.parametrize("name", ["gossip", "diffusion", "readings", "push-sum"])
 def test_both_engines_deliver_the_chosen_messages(runs, name, channel):

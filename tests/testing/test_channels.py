@@ -109,7 +109,7 @@ def test_our_own_clocks_keep_the_contract(tables):
     assert check_clock(parts.RecordedClock(tables["ticks"]), link=(1, 2)) is None
 
 
-@pytest.mark.one_in(8)
+@pytest.mark.one_in(12)
 @pytest.mark.parametrize("name", CHANNELS)
 def test_every_breach_of_a_channel_is_named(name):
     refused(check_channel, *CHANNELS[name])

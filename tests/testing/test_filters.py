@@ -84,7 +84,7 @@ LONG = (
 """Filters whose check is slow; others of their kind are checked each time."""
 
 
-@pytest.mark.one_in(4)
+@pytest.mark.one_in(8)
 @pytest.mark.parametrize("name", with_slow(SOUND, LONG))
 def test_our_own_filters_keep_the_contract(name):
     for part in SOUND[name]:

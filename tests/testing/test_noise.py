@@ -133,6 +133,7 @@ def test_one_lossier_direction_is_found():
     assert found_by(_check_channel, OneLossier(0.8)) >= 7
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("cls", [Slower, OneSlower])
 def test_slower_clocks_are_found(cls, monkeypatch):
     # The form of ticks is looked at elsewhere: here it takes most of the time, and `now` is added

@@ -91,19 +91,19 @@ def matchings():
     ]
 
 
-@pytest.mark.one_in(3)
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("k", with_slow(range(len(sensors())), {4}))
 def test_sound_sensors_pass(k):
     assert check_sensor(sensors()[k]) is None
 
 
-@pytest.mark.one_in(5)
+@pytest.mark.one_in(10)
 @pytest.mark.parametrize("k", range(len(plants())))
 def test_sound_plants_pass(k):
     assert check_plant(plants()[k]) is None
 
 
-@pytest.mark.one_in(4)
+@pytest.mark.one_in(12)
 @pytest.mark.parametrize("k", range(len(matchings())))
 def test_sound_matchings_pass(k):
     assert check_matching(matchings()[k]) is None

@@ -60,6 +60,7 @@ def test_a_folder_without_scenarios_is_no_empty_test(tmp_path):
 LONG = ("blind_unstable", "delayed_links", "diffusion_regression", "intermittent_random10")
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", with_slow(SHORT, LONG))
 def test_the_promises_of_our_files_are_kept(name):
     horizon = SHORT[name]
@@ -116,10 +117,10 @@ def test_a_broken_promise_fails_with_its_row():
         {"filter": {"kind": f"{Overconfident.__module__}:{Overconfident.__name__}"}}
     )
     with pytest.raises(AssertionError) as caught:
-        testing.assert_promises(wrong, runs=60)
+        testing.assert_promises(wrong, runs=30)
     head, *rows = str(caught.value).splitlines()
     assert head.startswith("intermittent-scalar: ")
-    assert "promises are broken (60 runs from seed 1, confidence 0.99)" in head
+    assert "promises are broken (30 runs from seed 1, confidence 0.99)" in head
     assert len(rows) == int(head.split()[1])
     assert all(" [" in row and "margin" in row for row in rows)
 

@@ -107,7 +107,7 @@ def told_at(run: netkf.Run, time: float, length: float) -> list[tuple[int, int]]
     return list(zip(log["peer"].tolist(), log["node"].tolist(), strict=True))
 
 
-@pytest.mark.one_in(3)
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("rule", ["split", "ci", "naive"])
 @pytest.mark.parametrize("text", [ROBOTS, CLOCKED], ids=["slots", "clocks"])
 def test_errors_of_own_blocks_follow_their_joint_recursion(

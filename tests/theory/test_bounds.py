@@ -146,6 +146,7 @@ DELAYED = {
 }
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("case", DELAYED.values(), ids=DELAYED)
 def test_precise_sensors_and_late_messages_have_a_bound(build, case):
     """Against the method of steps: over each delay what arrives is known."""
@@ -286,6 +287,7 @@ def test_threshold_where_every_node_sees_a_part(build):
     assert size[1] / size[0] > 1.4
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(
     ("A", "critical"),
     [
@@ -419,6 +421,7 @@ def test_limit_of_sensors_all_alike_is_the_centralised_filter_with_more_noise(bu
     assert theory.central_covariance(scenario)[0, 0] == pytest.approx(scalar(6.0), rel=1e-12)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("symmetric", [True, False])
 def test_theorem_2_by_simulation(ring, symmetric):
     """E[P_i(t)] <= bound: no mean of 300 runs lies above by 4 standard errors (72 comparisons)."""

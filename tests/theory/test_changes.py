@@ -199,6 +199,7 @@ def test_filters_that_do_not_know_are_said_to_be_wrong():
     np.testing.assert_allclose(aware.table["expected"], 2.0, rtol=1e-6)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("aware", [True, False])
 def test_check_follows_the_changes(aware):
     verdict = netkf.check(slots("diffusion", filter={} if aware else UNAWARE), runs=20)

@@ -89,6 +89,7 @@ def test_the_threshold_of_a_blind_node(build, rate):
     assert ends[2] / ends[1] == pytest.approx(np.exp(20.0 * 0.2), rel=0.02)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("factored", [0, 3000])
 def test_the_threshold_of_a_network_comes_from_few_linear_equations(build, monkeypatch, factored):
     """Nodes that nobody sees must average away 2 a: that is an eigenvalue of their Laplacian."""

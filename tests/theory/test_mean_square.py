@@ -461,6 +461,7 @@ def test_periodic_clocks_with_samples_at_their_ticks_are_slots(channel, tmp_path
     assert theory.mean_square_radius(sampled) == pytest.approx(radius, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_messages_that_take_time_under_periodic_clocks(tmp_path):
     """Against the errors of a long run without losses, which follow from its events alone."""
     sensor = {**SENSOR, "sampling": EACH}

@@ -103,7 +103,7 @@ def close(found, expected, tolerance):
     assert (np.abs(found - expected) <= tolerance * size).all()
 
 
-@pytest.mark.one_in(11)
+@pytest.mark.one_in(16)
 @pytest.mark.parametrize("channel", [{}, LOSSY, LATE], ids=["sure", "lossy", "late"])
 @pytest.mark.parametrize("sensors", [SAMPLED, MIXED], ids=["sampled", "mixed"])
 @pytest.mark.parametrize(("name", "at"), CASES, ids=["-".join(map(str, c)) for c in CASES])
@@ -120,7 +120,7 @@ def test_covariances_are_those_of_the_run(name, at, sensors, channel, tmp_path):
     assert np.linalg.eigvalsh(stacked).min() > -1e-12
 
 
-@pytest.mark.one_in(6)
+@pytest.mark.one_in(12)
 @pytest.mark.parametrize(("name", "at"), CASES, ids=["-".join(map(str, c)) for c in CASES])
 def test_errors_are_the_linear_map_of_the_engine(name, at, tmp_path):
     """Filters of one clock each come late; of several some do."""
@@ -165,6 +165,7 @@ def test_the_mean_of_errors_is_what_other_starts_add(name, at, tmp_path):
     close(law.covariance, error_law(scenario, run).covariance, 1e-9)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", ["intermittent", "gossip"])
 def test_on_unstable_plants_errors_keep_their_digits_and_their_law(name, tmp_path):
     # The origin moves after 10 and 20 seconds.

@@ -18,6 +18,7 @@ def regression():
     return netkf.load(SCENARIOS / "diffusion_regression.toml")
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(("p", "beta"), [(1.0, 2.1), (2.0, 3.0)])
 def test_the_level_against_quadrature(regression, p, beta):
     """|V| and |Delta| are independent multiples of chi variables: scalar noises of one variance at

@@ -156,7 +156,7 @@ def broken(rows):
     return {row.promise for row in rows if row.verdict == BROKEN}
 
 
-@pytest.mark.one_in(4)
+@pytest.mark.one_in(8)
 @pytest.mark.parametrize("name", HEALTHY)
 def test_healthy_parts_are_not_accused(name):
     table, changes = HEALTHY[name]
@@ -219,7 +219,7 @@ def with_class(table, key, name):
     return from_table(table)
 
 
-@pytest.mark.one_in(8)
+@pytest.mark.one_in(16)
 @pytest.mark.parametrize("name", WRONG)
 def test_wrong_parts_are_found(name):
     table, key, promise = WRONG[name]
@@ -251,7 +251,7 @@ def test_spreads_of_gaps_are_those_of_scipy(name):
     assert clock.gaps.spread == pytest.approx(law.var() / law.mean() ** 2, rel=1e-12)
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", GAPS)
 def test_gaps_are_uniform_numbers_however_short_the_run(name):
     (clock, law), random = GAPS[name], np.random.default_rng(3)
@@ -328,7 +328,7 @@ def with_states(z, random=np.random.default_rng(12)):  # noqa: B008
     return np.array([noise_draws(*run).states for run in zip(z, states, strict=True)])
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", TESTS)
 def test_tests_of_noise_keep_their_level(name):
     random, wrong, level = np.random.default_rng(7), 0, 0.05
