@@ -155,14 +155,29 @@ def parse_part(text: str) -> tuple[int, int]:
     return int(index), int(count)
 
 
+SOME, SIXTY = "(?=.*[1-9])", r"([0-5]?\d)"
+DURATIONS = {
+    r"(?=\d)(?:(\d{1,6})h)?(?:(\d{1,6})m)?(?:(\d{1,9})s)?": (3600.0, 60.0, 1.0),
+    # SLURM's own, but for 0, which is no limit there.
+    rf"{SOME}(\d{{1,5}})-([01]?\d|2[0-3])(?::{SIXTY})?(?::{SIXTY})?": (86400.0, 3600.0, 60.0, 1.0),
+    rf"{SOME}(\d{{1,6}}):{SIXTY}:{SIXTY}": (3600.0, 60.0, 1.0),
+    rf"{SOME}(\d{{1,7}})(?::{SIXTY})?": (60.0, 1.0),
+}
+"""Forms of a duration, and the seconds of the unit of each group."""
+DURATION_RULE = (
+    "must be hours, minutes and seconds, such as 50m or 1h30m, or a time limit of SLURM, not 0: "
+    "MINUTES, MINUTES:SECONDS, HOURS:MINUTES:SECONDS, DAYS-HOURS, DAYS-HOURS:MINUTES or "
+    "DAYS-HOURS:MINUTES:SECONDS"
+)
+
+
 def parse_duration(text: str) -> float:
-    """Return the seconds of a duration such as 50m or 1h30m; raises ArgumentTypeError."""
-    found = re.fullmatch(r"(?:(\d{1,6})h)?(?:(\d{1,6})m)?(?:(\d{1,9})s)?", text.strip())
-    if not found or not any(found.groups()):
-        rule = "must be hours, minutes and seconds, such as 50m or 1h30m"
-        raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
-    hours, minutes, seconds = (float(group or 0) for group in found.groups())
-    return 3600.0 * hours + 60.0 * minutes + seconds
+    """Return the seconds of a duration in one of the forms DURATIONS; raises ArgumentTypeError."""
+    for form, units in DURATIONS.items():
+        if found := re.fullmatch(form, text.strip(), re.ASCII):
+            groups = found.groups(default="0")
+            return sum(unit * float(group) for unit, group in zip(units, groups, strict=True))
+    raise argparse.ArgumentTypeError(f"{DURATION_RULE}; got {quote(text)}")
 
 
 def parse_columns(text: str) -> dict[str, str]:
@@ -233,7 +248,7 @@ ARRAY = (
     _flag("--slurm", "print a submission script for an array of SLURM jobs on the plan"),
     _option(
         "--time",
-        "time limit of each job in that script (default: 1h)",
+        "time limit of each job in that script, such as 1h or 01:00:00 (default: 1h)",
         type=parse_duration,
         default="1h",
         metavar="DURATION",
@@ -295,7 +310,7 @@ COMMANDS = (
             ),
             _option(
                 "--for",
-                "begin no run after so long, such as 50m; the status is 1 if some are left",
+                "begin no run after so long, 50m or 00:50:00; the status is 1 if some are left",
                 type=parse_duration,
                 dest="seconds",
                 metavar="DURATION",

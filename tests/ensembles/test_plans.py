@@ -1,5 +1,6 @@
 """Plans: what workers leave in a directory, in any order and however they end, is one ensemble."""
 
+import datetime
 import itertools
 import json
 import os
@@ -13,6 +14,7 @@ import time
 import pytest
 
 import netkf
+from netkf.cli.commands import parse_duration
 from netkf.cli.main import main
 from netkf.ensembles import block_files, checkpoints, parts, plans
 from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
@@ -207,7 +209,7 @@ def test_what_is_no_plan_is_refused_in_one_line(plan, tmp_path, capsys):
             assert files(folder) == before
     assert main(["plan", *LINE, "--out", str(plan)]) == 2
     assert "must be a new or empty directory" in capsys.readouterr().err
-    for bad in (["--part", "5/4"], ["--part", "x"], ["--for", "5x"], ["--for", ""]):
+    for bad in (["--part", "5/4"], ["--part", "x"]):
         with pytest.raises(SystemExit):
             main(["work", str(plan), *bad])
         assert len(capsys.readouterr().err.splitlines()) == 1
@@ -280,8 +282,37 @@ def test_a_worker_writes_bytes_for_runs_not_for_blocks(tmp_path, monkeypatch):
     assert len(list((tmp_path / "p" / "blocks").iterdir())) == 2
 
 
+# The forms that sbatch(1) gives for --time, and hours, minutes and seconds with their letters.
+DURATIONS = {
+    "50m": {"minutes": 50},
+    "1h30m": {"hours": 1, "minutes": 30},
+    "12s": {"seconds": 12},
+    "0s": {},
+    "90": {"minutes": 90},
+    "90:05": {"minutes": 90, "seconds": 5},
+    "01:00:00": {"hours": 1},
+    "48:00:30": {"hours": 48, "seconds": 30},
+    "2-0": {"days": 2},
+    "1-12:30": {"days": 1, "hours": 12, "minutes": 30},
+    "7-00:00:01": {"days": 7, "seconds": 1},
+}
+NO_DURATIONS = ["", "m", "1.5", "1m30", "1h:30", "1-", "-5", "1:60", "1:60:00", "1-24", "1:2:3:4"]
+NO_DURATIONS += ["0", "00:00:00", "UNLIMITED", "1:2:3-4", "x" * 5000]
+
+
+def test_durations_have_letters_or_the_forms_of_slurm(plan, capsys):
+    for text, expected in DURATIONS.items():
+        assert parse_duration(text) == datetime.timedelta(**expected).total_seconds(), text
+    for text in NO_DURATIONS:
+        with pytest.raises(SystemExit):
+            main(["work", str(plan), f"--for={text}"])
+        error = capsys.readouterr().err
+        assert len(error.splitlines()) == 1
+        assert "such as 50m or 1h30m, or a time limit of SLURM, not 0: MINUTES, " in error
+
+
 def test_slurm_script(tmp_path, capsys):
-    line = ["--out", str(tmp_path / "my plan"), "--tasks", "8", "--slurm", "--time", "1h30m"]
+    line = ["--out", str(tmp_path / "my plan"), "--tasks", "8", "--slurm", "--time", "01:30:00"]
     assert main(["plan", *LINE, *line]) == 0
     script = capsys.readouterr().out
     for words in ("--array=0-7", "--signal=TERM@", "--requeue", "--time=01:30:00", "--for 88m"):
