@@ -30,7 +30,7 @@ def _run(options: argparse.Namespace) -> int:
         merged = merge_plan(plan, options.mixed, finish=draw, note=lambda text: print_notes([text]))
     runs = plan.identity.runs
     if isinstance(merged, list):
-        print_missing(plan.directory, [Gap(1, runs, merged)])
+        print_missing(plan, [Gap(1, runs, merged)])
         return FAILED
     print_summary(plan.scenario, merged)
     print_ensemble(merged, runs)

@@ -33,6 +33,7 @@ if [ $status -eq 1 ]; then scontrol requeue "${{SLURM_ARRAY_JOB_ID}}_${{SLURM_AR
 exit $status
 
 # When all are done: {merge}
+# It lists the jobs whose runs are missing; sbatch --array=3,7-9 submits those of a list again.
 """
 MARGIN = 2
 """Minutes of a job that are left for its start, and for the end of its last block."""

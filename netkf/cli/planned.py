@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import filecmp
 import io
 import sys
 import time
+from bisect import bisect_right
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -112,14 +114,64 @@ def merge_study(plan: Plan, options: argparse.Namespace) -> int:
     gaps = _missing_runs(study_options.run, study_options, study)
     print_notes(study.worker.notes)
     if any(gap.missing for gap in gaps):
-        print_missing(plan.directory, gaps, rounds)
+        print_missing(plan, gaps, rounds)
         return FAILED
     if len(require_alike(study.installations, plan.directory, options.mixed)) > 1:
         print_notes(["results are of machines of different kinds: last digits may be others"])
-    study_options = _study_options(plan, options)
-    if options.no_plot and hasattr(study_options, "no_plot"):
-        study_options.no_plot = True
-    return _run_on(study_options.run, study_options, PlannedStudy(plan.directory, Worker(None)))
+    status = _merge_again(_study_options(plan, options), plan)
+    if status is None:
+        study_options, worker = _study_options(plan, options), Worker(None)
+        status = _run_on(study_options.run, study_options, PlannedStudy(plan.directory, worker))
+    return status
+
+
+def _merge_again(options: argparse.Namespace, plan: Plan) -> int | None:
+    """Finish a study whose results an earlier merge has written, or a part of them: add what is
+    missing. Return the exit status; None, and nothing happened, if there are no such results.
+    """
+    from netkf.ensembles.parts import Worker
+    from netkf.ensembles.planned_study import PlannedStudy
+    from netkf.runs.directory_lock import lock_directory
+    from netkf.runs.files import copy_file
+
+    numbered = Path("runs").glob("*-sweep-*") if plan.arguments[0] == "sweep" else ()
+    out = getattr(options, "out", None)
+    folders = [f for f in ([out] if out else sorted(numbered)) if (f / "scenario.toml").exists()]
+    if not folders:
+        return None
+    text, notes = io.StringIO(), io.StringIO()
+    with TemporaryDirectory() as temporary:
+        options.out = new = Path(temporary) / "out"
+        with contextlib.redirect_stdout(text), contextlib.redirect_stderr(notes):
+            status = _run_on(options.run, options, PlannedStudy(plan.directory, Worker(None)))
+        found = [(folder, _left_out(folder, new)) for folder in folders]
+        folder, missing = next((pair for pair in found if pair[1] is not None), (new, None))
+        if missing is None:
+            return None
+        with lock_directory(folder):
+            for name in missing:
+                copy_file(new / name, folder / name)
+    print(notes.getvalue(), end="", file=sys.stderr)
+    done = f"nothing left to do in {folder}" if not missing else f"written to {folder}"
+    said = text.getvalue().replace(f"written to {new}", done)
+    print(said.replace(str(new), str(folder)), end="")
+    return status
+
+
+def _left_out(folder: Path, new: Path) -> list[str] | None:
+    """Return the files of ``new`` that a ``folder`` of the same results lacks, the last of which
+    says that it is complete; None if it has other results.
+    """
+    from netkf.runs.documents import FINAL_STATUSES, DamagedError, read_document
+
+    names = [str(file.relative_to(new)) for file in new.rglob("*") if file.is_file()]
+    same, other, missing = filecmp.cmpfiles(new, folder, names, shallow=False)
+    with contextlib.suppress(DamagedError):
+        if other == ["manifest.json"]:
+            unfinished = read_document(folder / other[0]).get("status") not in FINAL_STATUSES
+            other, missing = ([], missing + other) if unfinished else (other, missing)
+    missing.sort(key=lambda name: name in ("manifest.json", "verdict.json"))
+    return missing if "scenario.toml" in same and not other else None
 
 
 def _study_options(plan: Plan, given: argparse.Namespace) -> argparse.Namespace:
@@ -130,6 +182,8 @@ def _study_options(plan: Plan, given: argparse.Namespace) -> argparse.Namespace:
         raise ScenarioError("DIR", rule, str(plan.directory), "write the plan again")
     options.copy, options.trust = plan.directory / "scenario.toml", given.trust
     options.plan = None
+    if getattr(given, "no_plot", False) and hasattr(options, "no_plot"):
+        options.no_plot = True
     return options
 
 
@@ -176,8 +230,10 @@ def _run_on(
         return run(options)
 
 
-def print_missing(directory: Path, gaps: list[Gap], rounds: bool = False) -> None:
+def print_missing(plan: Plan, gaps: list[Gap], rounds: bool = False) -> None:
     """Print which runs have no result, and what to do."""
+    from netkf.ensembles.replicas import missing_ranges
+
     short = [gap for gap in gaps if gap.missing]
     missing = sum(len(runs) for gap in short for runs in gap.missing)
     total = sum(gap.runs for gap in gaps)
@@ -188,11 +244,33 @@ def print_missing(directory: Path, gaps: list[Gap], rounds: bool = False) -> Non
     more = f"; and {len(short) - SHOWN} further ensembles" if len(short) > SHOWN else ""
     of = f"{total:,} runs" + (f" of round {short[0].number}" if rounds else "")
     print(f"{missing:,} of {of} have no result: {'; '.join(where)}{more}")
-    print(f"go on with netkf work {directory}")
+    again = ""
+    if plan.tasks > 1:
+        done = [(part, 1) for part in set(range(plan.tasks)) - _missing_parts(short, plan.tasks)]
+        array = ",".join(map(_describe_range, missing_ranges(done, range(plan.tasks))))
+        again = f", or submit these of its {plan.tasks:,} jobs again: --array={array}"
+    print(f"go on with netkf work {plan.directory}{again}")
+
+
+def _missing_parts(gaps: list[Gap], tasks: int) -> set[int]:
+    """Return the numbers of those of ``tasks`` parts that have missing runs."""
+    from netkf.ensembles.parts import Part
+
+    parts: set[int] = set()
+    starts = {gap.runs: [Part(k, tasks).of(gap.runs).start for k in range(tasks)] for gap in gaps}
+    for gap in gaps:
+        for runs in gap.missing:
+            first, last = (bisect_right(starts[gap.runs], run) for run in (runs[0], runs[-1]))
+            parts.update(range(first - 1, last))
+    return parts
 
 
 def _describe_ranges(missing: list[range]) -> str:
     """Return ranges of runs as text."""
-    listed = [f"{gap[0]}" if len(gap) == 1 else f"{gap[0]}-{gap[-1]}" for gap in missing[:SHOWN]]
     more = f" and {len(missing) - SHOWN} further ranges" if len(missing) > SHOWN else ""
-    return ", ".join(listed) + more
+    return ", ".join(map(_describe_range, missing[:SHOWN])) + more
+
+
+def _describe_range(numbers: range) -> str:
+    """Return a range of runs, or of jobs, as text."""
+    return f"{numbers[0]}" if len(numbers) == 1 else f"{numbers[0]}-{numbers[-1]}"

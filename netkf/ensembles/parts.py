@@ -65,8 +65,9 @@ def part_of_array(tasks: int, environment: Mapping[str, str] = os.environ) -> Pa
     """Return the part of this job of an array by the variables of SLURM, PBS, Grid Engine or LSF;
     without such variables the whole.
 
-    Where the system does not tell the number of jobs, or its indices have gaps, as when some jobs
-    of an array are submitted again, the array is that of ``tasks`` jobs for which the plan is.
+    Where the system does not tell the number of jobs, or its indices have gaps or begin later than
+    at 1, as when some jobs of an array are submitted again, the array is that of ``tasks`` jobs for
+    which the plan is.
     """
 
     def read(name: str, default: int) -> int:
@@ -81,7 +82,7 @@ def part_of_array(tasks: int, environment: Mapping[str, str] = os.environ) -> Pa
         first, step = read(names.first, 1), max(1, read(names.step, 1))
         regular = (read(names.last, -1) - first) // step + 1
         count = read(names.count, regular)
-        if count < 1 or count != regular:
+        if count < 1 or count != regular or (first > 1 and first + step * (count - 1) <= tasks):
             return Part(index, tasks)
         return Part((index - first) // step, count)
     return Part(0, 1)

@@ -263,16 +263,16 @@ def write_scenario(
     modules. Raises WriteError.
     """
     for source in source_files(scenario):
-        _copy(source.full, directory / source.name)
+        copy_file(source.full, directory / source.name)
     for module in find_module_files(scenario).values():
         if module is not None:
-            _copy(module, directory / module.name)
+            copy_file(module, directory / module.name)
     table = resolve_defaults(scenario) if resolve else as_table(scenario)
     table["seed"] = scenario.seed if seed is None else seed
     write_text(directory / "scenario.toml", to_toml(table))
 
 
-def _copy(source: Path, target: Path) -> None:
+def copy_file(source: Path, target: Path) -> None:
     """Copy the file ``source`` to ``target`` atomically."""
     if target.is_file() and target.read_bytes() == source.read_bytes():
         return

@@ -70,7 +70,9 @@ def test_parts_of_a_study_are_the_study(name, tmp_path, capsys):
     for part in ("3/3", "1/3"):
         assert main(["work", str(plan), "--part", part]) == (1 if name == "until" else 0)
     assert main(["merge", str(plan)]) == 1
-    assert "have no result: " in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "have no result: " in printed
+    assert "or submit these of its 3 jobs again: --array=" in printed
     assert not out.exists()
     assert main(["work", str(plan)]) == 0
     capsys.readouterr()
@@ -180,6 +182,47 @@ def test_two_workers_on_one_block_do_no_harm(part, simulated, plan, whole, monke
     assert f": {simulated} runs simulated" in capsys.readouterr().out
     assert main(["merge", str(plan)]) == 0
     assert files(plan.with_name("out")) == whole
+
+
+def test_a_second_merge_knows_the_results_of_the_first(plan, whole, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    assert main(["work", str(plan)]) == 0
+    capsys.readouterr()
+    assert main(["merge", str(plan)]) == 0
+    first = capsys.readouterr().out
+    assert main(["merge", str(plan)]) == 0
+    again = capsys.readouterr().out
+    assert again.splitlines()[:-2] == first.splitlines()[:-2]  # the next one has the time it took
+    assert again.splitlines()[-1] == f"nothing left to do in {out}"
+    # What a full disk left out of the first, and what is not netkf's.
+    (out / "sweep.csv").unlink()
+    manifest = json.loads((out / "manifest.json").read_text())
+    write_sealed(out / "manifest.json", {**manifest, "status": "failed"})
+    (out / "notes.txt").write_text("mine")
+    assert main(["merge", str(plan)]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == f"written to {out}"
+    assert files(out) == {**whole, Path("notes.txt"): b"mine"}
+    (out / "sweep.csv").write_text("edited")
+    assert main(["merge", str(plan)]) == 2
+    assert "must be a new or empty directory" in one_line(capsys)
+    assert (out / "sweep.csv").read_text() == "edited"
+
+    # The default directory is the first free one, unless an earlier one has these results.
+    monkeypatch.chdir(tmp_path)
+    no_out = shutil.copytree(plan, tmp_path / "no out")
+    document = json.loads((no_out / "manifest.json").read_text())
+    at = document["arguments"].index("--out")
+    del document["sha256"], document["arguments"][at : at + 2]
+    write_sealed(no_out / "manifest.json", document)
+    for last in (
+        "written to runs/poisson-ring-sweep-1",
+        "nothing left to do in runs/poisson-ring-sweep-1",
+    ):
+        assert main(["merge", str(no_out)]) == 0
+        assert capsys.readouterr().out.splitlines()[-1] == last
+    (tmp_path / "runs" / "poisson-ring-sweep-1" / "sweep.csv").write_text("edited")
+    assert main(["merge", str(no_out)]) == 0
+    assert files(tmp_path / "runs" / "poisson-ring-sweep-2") == whole
 
 
 def test_what_is_no_plan_of_a_study_is_refused_in_one_line(plan, tmp_path, capsys):

@@ -5,6 +5,7 @@ import itertools
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -76,6 +77,25 @@ def test_shuffled_workers_are_one_run(plan, whole, capsys):
     assert files(plan) == whole
 
 
+@pytest.mark.parametrize("ended", [(0, 2), (4,)])
+def test_jobs_that_merge_lists_are_submitted_again(ended, plan, whole, monkeypatch, capsys):
+    for part in ended:
+        assert work(plan, "--part", f"{part}/5") == 0
+    assert merge(plan) == 1
+    listed = re.search(r"these of its 5 jobs again: --array=([\d,-]+)\n", capsys.readouterr().out)
+    ranges = [one.split("-") for one in listed[1].split(",")]
+    jobs = [job for one in ranges for job in range(int(one[0]), int(one[-1]) + 1)]
+    assert jobs == [job for job in range(5) if job not in ended]
+    array = {"MIN": jobs[0], "MAX": jobs[-1], "COUNT": len(jobs), "STEP": 1}
+    for name, value in array.items():
+        monkeypatch.setenv(f"SLURM_ARRAY_TASK_{name}", str(value))
+    for job in jobs:
+        monkeypatch.setenv("SLURM_ARRAY_TASK_ID", str(job))
+        assert work(plan) == 0
+    assert merge(plan) == 0
+    assert files(plan) == whole
+
+
 def test_parts_cover_all_runs_once_from_0_or_from_1():
     for runs, count in itertools.product((1, 2, 21, 64, 1000), (1, 2, 3, 7, 64)):
         for first in (0, 1):
@@ -94,6 +114,8 @@ def test_parts_cover_all_runs_once_from_0_or_from_1():
         ({"SLURM_ARRAY_TASK_ID": "6", "MIN": "2", "MAX": "8", "STEP": "2"}, Part(2, 4)),
         # Three jobs of the plan's five that are submitted again.
         ({"SLURM_ARRAY_TASK_ID": "4", "MIN": "1", "MAX": "4", "COUNT": "3"}, Part(4, 5)),
+        ({"SLURM_ARRAY_TASK_ID": "4", "MIN": "3", "MAX": "4", "COUNT": "2"}, Part(4, 5)),
+        ({"SLURM_ARRAY_TASK_ID": "2", "MIN": "2", "MAX": "2", "COUNT": "1"}, Part(2, 5)),
         ({"PBS_ARRAY_INDEX": "3"}, Part(3, 5)),
         ({"SGE_TASK_ID": "undefined"}, Part(0, 1)),
         ({"SGE_TASK_ID": "3", "SGE_TASK_FIRST": "1", "SGE_TASK_LAST": "9"}, Part(2, 9)),
