@@ -10,7 +10,8 @@ import numpy as np
 
 from netkf.figures.figure_data import FigureData, UnavailableError
 from netkf.figures.names import SERIES
-from netkf.figures.style import INK, Picture, finish_figure, new_figure
+from netkf.figures.network import MAX_LABELLED_NODES
+from netkf.figures.style import INK, MUTED, Picture, finish_figure, new_figure
 from netkf.linalg.arrays import FloatArray
 from netkf.trace.run import Run
 
@@ -41,7 +42,8 @@ def plane_figure(data: FigureData) -> Picture:
     if not paths:
         reason = "No node estimates coordinates of its own: those that a plant of [[plants]] names"
         raise UnavailableError(f"{reason} by position = [0, 1].")
-    landmarks = _landmarks(data.scenario)
+    names = landmark_names(data.scenario)
+    landmarks = np.reshape([*names], (-1, 2))
     points = np.concatenate([*(path.xhat for path in paths), landmarks])
     width, height = np.ptp(points[np.isfinite(points).all(axis=1)], axis=0)
     # Of one scale along both axes.
@@ -49,6 +51,8 @@ def plane_figure(data: FigureData) -> Picture:
     axes: Any = figure.subplots()
     label = "landmark" if len(landmarks) else ""
     axes.scatter(*landmarks.T, marker="+", s=45, linewidths=1.2, color=INK, zorder=4, label=label)
+    for place, name in list(names.items())[:MAX_LABELLED_NODES]:
+        axes.annotate(name, place, (3, 3), textcoords="offset points", fontsize=6, color=MUTED)
     labels = ["true path", "estimate of the node", f"{LEVEL:.0%} of errors, by P"]
     for k, path in enumerate(paths):
         _draw_path(axes, path, SERIES[k % len(SERIES)].colour, labels if k == 0 else [""] * 3)
@@ -75,14 +79,15 @@ def _paths(run: Run) -> list[_Path]:
     return paths
 
 
-def _landmarks(scenario: Any) -> FloatArray:
-    """Return the places (L, 2) that robots look at."""
-    seen = [
-        np.asarray(sensor.positions)
-        for sensor in scenario.sensors
-        if getattr(sensor, "heading", None) is not None and not isinstance(sensor.positions, str)
-    ]
-    return np.unique(np.concatenate([np.zeros((0, 2)), *seen]), axis=0)
+def landmark_names(scenario: Any) -> dict[tuple[float, float], str]:
+    """Return the names, by place, of what robots look at: the ids in tables of readings, if any."""
+    names = {}
+    for sensor in scenario.sensors:
+        if getattr(sensor, "heading", None) is not None and not isinstance(sensor.positions, str):
+            has_ids = sensor.record is not None and sensor.record.has_anchors
+            for k, place in zip(sensor.places, np.asarray(sensor.positions).tolist(), strict=True):
+                names[tuple(place)] = str(k) if has_ids else ""
+    return names
 
 
 def _draw_path(axes: Any, path: _Path, colour: str, labels: Sequence[str]) -> None:

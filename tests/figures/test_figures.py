@@ -8,6 +8,7 @@ import pytest
 
 import netkf
 from netkf.cli.main import main
+from netkf.figures import plane
 from netkf.figures.catalogue import FIGURES, FigureSet
 from netkf.figures.names import FIGURE_NAMES
 from netkf.figures.style import style_context
@@ -289,6 +290,15 @@ def test_paths_in_the_plane_are_those_of_the_nodes_and_their_own_estimates():
     np.testing.assert_array_equal(drawn[3], blocks[2].xhat[:, :2])
     seen = axes.collections[0].get_offsets()
     assert len(seen) == 15
+    assert [text.get_text() for text in axes.texts[:15]] == [str(k) for k in range(6, 21)]
+
+
+def test_landmarks_have_the_numbers_of_the_log():
+    """Those of the data set's own table, subject, x and y."""
+    scenario = netkf.load(SCENARIOS / "blocks" / "mrclam_small" / "scenario.toml")
+    table = SCENARIOS / "data" / "mrclam_small" / "Landmark_Groundtruth.dat"
+    rows = np.loadtxt(table)
+    assert plane.landmark_names(scenario) == {(x, y): f"{k:.0f}" for k, x, y, *_ in rows}
 
 
 def test_the_plane_needs_nodes_that_estimate_their_coordinates(drawing):
