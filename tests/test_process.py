@@ -15,7 +15,7 @@ import pytest
 from netkf.cli import process
 from netkf.cli.main import main
 from netkf.core.printable import one_line, printable
-from tests.conftest import SCENARIOS
+from tests.conftest import SCENARIOS, scenario_files, with_slow
 
 RING = str(SCENARIOS / "poisson_ring.toml")
 QUICK = shlex.quote(str(SCENARIOS / "ulb_library.toml"))
@@ -295,6 +295,26 @@ def test_commands_import_what_they_need(words, unneeded, tmp_path):
     command = [sys.executable, "-c", UNNEEDED, seen, *words]
     subprocess.run(command, env=plain, capture_output=True, check=False)
     assert not {*unneeded} & {*seen.read_text().split()}
+
+
+PASSES = """
+import sys, netkf.cli.main
+from numba.core import event
+with event.install_recorder("numba:run_pass") as seen:
+    netkf.cli.main.main(sys.argv[2:])
+print(len(seen.buffer), file=open(sys.argv[1], "w"))
+"""
+ALL = [file.stem for file in scenario_files()]
+
+
+@pytest.mark.parametrize("name", with_slow(ALL, {*ALL} - {"threshold"}))
+def test_a_second_run_compiles_nothing(name, tmp_path):
+    """The compiler's passes are counted: verbs are compiled without a dispatcher's event."""
+    words = ["run", str(SCENARIOS / f"{name}.toml"), "--no-plot", "--out"]
+    for k in range(2):
+        command = [sys.executable, "-c", PASSES, tmp_path / "seen", *words, tmp_path / f"{k}"]
+        subprocess.run(command, capture_output=True, check=True)
+    assert (tmp_path / "seen").read_text() == "0\n"
 
 
 def cpu_seconds(*words):
