@@ -133,10 +133,12 @@ def _merge_again(options: argparse.Namespace, plan: Plan) -> int | None:
     from netkf.ensembles.planned_study import PlannedStudy
     from netkf.runs.directory_lock import lock_directory
     from netkf.runs.files import copy_file
+    from netkf.scenario.writing import resolve_defaults, to_toml
 
     numbered = Path("runs").glob("*-sweep-*") if plan.arguments[0] == "sweep" else ()
-    out = getattr(options, "out", None)
-    folders = [f for f in ([out] if out else sorted(numbered)) if (f / "scenario.toml").exists()]
+    out, same = getattr(options, "out", None), to_toml(resolve_defaults(plan.scenario)).encode()
+    files = [folder / "scenario.toml" for folder in ([out] if out else sorted(numbered))]
+    folders = [file.parent for file in files if file.is_file() and file.read_bytes() == same]
     if not folders:
         return None
     text, notes = io.StringIO(), io.StringIO()
