@@ -344,7 +344,6 @@ def _transposes(scenario: Scenario) -> bool:
 
 
 def _require_covariances(scenario: Scenario, results: list[ReplicaResult]) -> None:
-    """Raise TheoryError if no covariance can be checked, or if runs diverged as expected."""
     summaries = [result.summary for result in results if result.summary is not None]
     diverged = len(results) - len(summaries)
     # A class that diverges where its base does not breaks a promise; a built-in one says nothing.
@@ -435,7 +434,6 @@ def _look_again(
 
 
 def _require_earlier(scenario: Scenario, earlier: Verdict | None, seed: int, runs: int) -> None:
-    """Raise ScenarioError unless runs can be added to an ``earlier`` verdict."""
     if earlier is None:
         return
     if (earlier.scenario, earlier.seed) != (scenario.name, seed):

@@ -229,7 +229,6 @@ def fold_followers(rows: Sequence[Evidence]) -> list[Evidence]:
 
 
 def _run_test(promise: Promise, samples: Any, level: float) -> Finding:
-    """Return the finding of a test; undecided if theory or linear algebra fails."""
     try:
         return promise.test(samples, level)
     except TheoryError as error:

@@ -171,7 +171,6 @@ def _bound_approaches_limit(samples: HybridSamples, level: float) -> Finding:
 
 
 def _constant_gains_are_worse(samples: HybridSamples, level: float) -> Finding:
-    """Check H Remark 1 of the hybrid paper."""
     promised, times = (
         with_promised_filter(samples.scenario),
         np.array(check_times(samples.scenario)),
@@ -218,7 +217,6 @@ def _slowest_mixing(mixing: scipy.sparse.csr_array) -> float:
 
 @lru_cache(maxsize=8)
 def _with_faster_links(scenario: Scenario, factor: float) -> Scenario:
-    """Return the scenario with all rates of links multiplied by ``factor``."""
     clock = scenario.network.activation
     if not isinstance(clock, (Poisson, Renewal)) or clock.rate is None:
         raise TheoryError("the clocks have no rate to raise")
@@ -327,7 +325,6 @@ def _settling_rows(scenario: Scenario) -> list[Assumption]:
 
 
 def _require_constant_gains(scenario: Scenario) -> None:
-    """Raise TheoryError if there is no bound with constant gains beside H (12)."""
     if not scenario.filter.algorithm.timing.talks:
         raise TheoryError("without messages the gains are those of Kalman-Bucy filters")
     if has_steady_state(scenario):
@@ -335,7 +332,6 @@ def _require_constant_gains(scenario: Scenario) -> None:
 
 
 def _require_limit(scenario: Scenario) -> None:
-    """Raise TheoryError if the steady bound has no limit S that can be computed."""
     if len(scenario.nodes) == 1 or scenario.network.channel.delay.fixed != 0.0:
         raise TheoryError("S is the limit for links that take no time")
     faster = _with_faster_links(scenario, 10.0 * _mixing_factor(scenario))

@@ -294,7 +294,6 @@ def _in_support(samples: IntermittentSamples, level: float) -> Finding:
 
 
 def _check_arrival_counts(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare the numbers of readings that arrive with binomial ones, R (12)."""
     pairs = _heard_directions(samples.scenario)  # (sender, receiver) of each directed link
     sent, arrived = samples.runs.sent.sum(axis=0), samples.runs.arrived.sum(axis=0)
     intervals = []
@@ -338,7 +337,6 @@ def _outage_factors(scenario: Scenario) -> dict[int, float]:
 
 
 def _mean_diverges(samples: IntermittentSamples, level: float) -> Finding:
-    """Check that a lower bound on E[P] grows as the largest factor of outages says."""
     scenario, factors = samples.scenario, _outage_factors(samples.scenario)
     node = max(factors, key=lambda k: factors[k])
     F, Q = scenario.slot_belief

@@ -177,7 +177,6 @@ def _mean_square(samples: PushSumSamples, level: float) -> Finding:
 
 
 def _gamma_certified(samples: PushSumSamples, level: float) -> Finding:
-    """Check that gamma of P Theorem 6 is at least the exact minimum."""
     scenario = with_promised_filter(samples.scenario)
     gamma, needed = minimum_gamma(scenario, "mean-square"), exact_minimum_gamma(scenario)
     margin = float(gamma - needed)

@@ -69,7 +69,6 @@ def _summary_lines(verdict: Verdict) -> list[str]:
 
 
 def _broken_again(broken: list[Evidence], command: str) -> list[str]:
-    """Return lines with the broken promises and the ``command`` that replays each."""
     lines = []
     for row in broken:
         values = f": seen {row.seen:.4g}, expected {row.expected:.4g}"

@@ -146,7 +146,6 @@ def _infinite_numbers(verdict: Verdict) -> list[tuple[int, str, bool]]:
 
 
 def _read_rows(document: dict[str, Any]) -> tuple[Evidence, ...]:
-    """Return the rows of the JSON of a verdict, with nan and infinite numbers restored."""
     rows = [dict(row) for row in document["rows"]]
     for row in rows:
         row |= {name: np.nan for name in NUMBERS if row[name] is None}
@@ -156,6 +155,5 @@ def _read_rows(document: dict[str, Any]) -> tuple[Evidence, ...]:
 
 
 def _read_results(path: Path) -> list[ReplicaResult]:
-    """Return the results of the replicas in the file ``path``, in order."""
     with np.load(path, allow_pickle=False) as file:
         return results_of_columns({name: file[name] for name in file.files})

@@ -29,7 +29,6 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _check(scenario: Scenario, options: argparse.Namespace) -> int:
-    """Compute, write and print the verdict; return the exit status, 1 if a promise is broken."""
     from netkf.checks.points import sampling_note
     from netkf.checks.report import verdict_json, verdict_text
     from netkf.scenario.usage import unused_notes
@@ -64,7 +63,6 @@ def _check(scenario: Scenario, options: argparse.Namespace) -> int:
 
 
 def _run_check(scenario: Scenario, options: argparse.Namespace, earlier: Verdict | None) -> Verdict:
-    """Return the verdict on ``--runs`` runs, which include those of an ``earlier`` one."""
     from netkf.checks.check import check
     from netkf.checks.looks import MAX_LOOKED_RUNS
 

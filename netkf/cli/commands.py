@@ -92,7 +92,6 @@ def _flag(name: str, text: str) -> Option:
 
 
 def _integer(text: str, least: int, largest: int) -> int:
-    """Return an integer from ``least`` to ``largest``; raises ArgumentTypeError."""
     # Twenty digits suffice to compare: Python refuses to convert texts of thousands.
     if not text.isdecimal() or not least <= int(text[:20]) <= largest:
         rule = f"must be an integer of at least {least} and at most {largest:,}"

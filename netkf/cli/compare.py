@@ -8,7 +8,6 @@ from netkf.cli.options import print_json
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Print the comparison of run directories; return the exit status."""
     from netkf.studies.compare import compare
     from netkf.studies.tables import format_comparison
 

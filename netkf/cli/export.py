@@ -15,7 +15,6 @@ NEXT = {
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Write the files and print their paths; return the exit status."""
     from netkf.core.errors import ScenarioError
     from netkf.ensembles.monte_carlo import Ensemble
     from netkf.studies.opening import open as open_directory

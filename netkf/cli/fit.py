@@ -13,7 +13,6 @@ from netkf.core.errors import ScenarioError
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Fit, write and print; return the exit status."""
     if options.noise:
         return _fit_noise(options)
     if options.set:
@@ -41,7 +40,6 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _fit_noise(options: argparse.Namespace) -> int:
-    """Print the variances of the noises and the model that has them."""
     from netkf.runs.tables import format_number, format_table
     from netkf.scenario.reading import load
     from netkf.studies.likelihood import fit_noise

@@ -6,7 +6,6 @@ import argparse
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Write the files, and print their paths and notes; return the exit status."""
     from netkf.logs.importing import import_log
 
     files, notes = import_log(

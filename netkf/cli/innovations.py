@@ -9,7 +9,6 @@ from netkf.cli.options import FAILED, load_scenario, print_json, print_table_not
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Simulate, test and print; return the exit status."""
     from netkf.runs.simulate import simulate
     from netkf.studies.innovation_tests import format_innovations, innovations
 

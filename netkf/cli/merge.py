@@ -12,7 +12,6 @@ from netkf.cli.run import print_ensemble, print_summary
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Merge what workers left; return the exit status, 1 if results are missing."""
     from netkf.ensembles.plans import merge_plan, open_plan
     from netkf.ensembles.replicas import Gap
     from netkf.runs.directory_lock import lock_directory

@@ -7,7 +7,6 @@ from importlib.util import find_spec
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Write a scenario and its tests, and print how to run them; return the exit status."""
     from netkf.runs.template import write_template
 
     scenario, tests = write_template(options.name, options.folder)

@@ -40,7 +40,6 @@ MARGIN = 2
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Write the plan; return the exit status."""
     from netkf.ensembles.directory import EnsembleOptions
     from netkf.ensembles.plans import plan_ensemble
     from netkf.runs.directory_lock import lock_directory

@@ -222,7 +222,6 @@ def _run_on(
     study: PlannedStudy,
     pool_options: PoolOptions | None = None,
 ) -> int:
-    """Run a study whose results are those of a plan; return its exit status."""
     from netkf.ensembles.pools import PoolOptions, make_pool
 
     given = pool_options or PoolOptions(1)
@@ -268,7 +267,6 @@ def _missing_parts(gaps: list[Gap], tasks: int) -> set[int]:
 
 
 def _describe_ranges(missing: list[range]) -> str:
-    """Return ranges of runs as text."""
     more = f" and {len(missing) - SHOWN} further ranges" if len(missing) > SHOWN else ""
     return ", ".join(map(_describe_range, missing[:SHOWN])) + more
 

@@ -13,7 +13,6 @@ from netkf.figures.names import FIGURE_NAMES, FIT_FIGURES, FIT_FILE, FORMATS
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Draw figures of directories into files and print their paths; return the exit status."""
     from netkf.studies.opening import open as open_directory
 
     if find_spec("matplotlib") is None:
@@ -71,7 +70,6 @@ def _check_output(out: Path, directories: int) -> None:
 
 
 def _figure_names(text: str) -> list[str]:
-    """Return the names of a list separated by commas; raises ScenarioError."""
     names = [name.strip() for name in text.split(",") if name.strip()]
     if not names:
         raise ScenarioError("--figure", "must name figures", text, "leave it out to draw all")

@@ -209,7 +209,6 @@ class SafeStream:
 
     @contextlib.contextmanager
     def _handle_failures(self) -> Iterator[None]:
-        """Raise OutputError for failures, unless lossy; discard the output of broken pipes."""
         try:
             yield
         except BrokenPipeError:

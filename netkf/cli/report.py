@@ -6,7 +6,6 @@ import argparse
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Write the page and print its path; return the exit status."""
     from netkf.report.page import write_report
 
     path = write_report(options.directories, options.out, options.replica, options.trust)

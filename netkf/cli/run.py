@@ -22,7 +22,6 @@ MIN_RATED_EVENTS = 10_000  # of fewer events a run takes as long as its preparat
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Simulate one run or several into a directory; return the exit status."""
     is_ensemble = (options.runs or 1) > 1
     if is_ensemble and options.replica is not None:
         remedy = "leave out --runs or --replica"

@@ -7,7 +7,6 @@ import json
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Print the JSON Schema, or the reference of keys in Markdown; return the exit status."""
     if options.markdown:
         from netkf.scenario.schema_page import schema_page
 

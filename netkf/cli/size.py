@@ -11,7 +11,6 @@ from netkf.core.errors import ScenarioError
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Search the value and print it; return the exit status, 1 if there is none."""
     from netkf.studies.parameter_grid import parse_interval
     from netkf.studies.size import size
     from netkf.studies.tables import format_answer, format_sizing

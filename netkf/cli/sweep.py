@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Simulate a grid of scenarios into a directory and print the table; return the exit status."""
     from netkf.ensembles.pools import PoolOptions
     from netkf.runs.directory_lock import lock_directory
     from netkf.studies.parameter_grid import parse_grid
@@ -47,7 +46,6 @@ def _run(options: argparse.Namespace) -> int:
 def _print_sweep(
     scenario: Scenario, completed: CompletedSweep, options: argparse.Namespace
 ) -> None:
-    """Print the table of a finished sweep and its duration, or JSON with ``--json``."""
     from netkf.studies.tables import format_sweep
 
     print_table_notes(scenario)

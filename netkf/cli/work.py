@@ -10,7 +10,6 @@ from netkf.cli.progress import ProgressLine
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Simulate the runs of a part without a result; return the exit status, 1 if some are left."""
     from netkf.ensembles.parts import Part, part_of_array
     from netkf.ensembles.plans import open_plan, work_on_plan
     from netkf.ensembles.pools import PoolOptions

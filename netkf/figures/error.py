@@ -96,12 +96,10 @@ def _mean_headline(rows: list[dict[str, Any]]) -> str:
 
 
 def _is_known(value: Any) -> bool:
-    """Return True if a value is a finite number, not None."""
     return value is not None and math.isfinite(value)
 
 
 def _known_or_zero(value: Any) -> float:
-    """Return a value as a number, 0 if it is None or not finite."""
     return float(value) if _is_known(value) else 0.0
 
 

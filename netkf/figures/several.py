@@ -111,7 +111,6 @@ def _high(curve: ErrorCurve) -> FloatArray:
 
 
 def _headline(curves: Sequence[ErrorCurve]) -> str:
-    """Return which curve has the smallest mean after time 0."""
     means = []
     for curve in curves:
         after = curve.square[curve.times > 0.0]

@@ -69,7 +69,6 @@ class Picture(Figure):
     """A figure that notebooks display without pyplot."""
 
     def _repr_png_(self) -> bytes:
-        """Return the PNG that notebooks display."""
         buffer = io.BytesIO()
         with style_context():
             self.savefig(buffer, format="png", dpi=RESOLUTION)
@@ -118,7 +117,6 @@ def break_lines(text: str, width: float, size: float, weight: str = "normal") ->
 
 
 def _split_word(line: str, width: float, size: float, weight: str) -> list[str]:
-    """Return a line in pieces of at most ``width`` points, several if it is one long word."""
     pieces = []
     while len(line) > 1 and text_width(line, size, weight) > width:
         count = max(1, int(len(line) * width / text_width(line, size, weight)) - 1)
@@ -180,7 +178,6 @@ def _axes_width(axes: Any) -> float:
 
 
 def _legend_columns(labels: Sequence[str], width: float) -> int:
-    """Return the largest number of legend columns that fit ``width`` points."""
     # Handle, gaps and column spacing take about six font sizes.
     widths = [text_width(label, LEGEND_SIZE) + 6.0 * LEGEND_SIZE for label in labels]
     for count in range(len(labels), 1, -1):

@@ -254,7 +254,6 @@ _node_pair = tuple_of(_node, _node, description="a pair of node ids")
 
 
 def _is_list(value: Any) -> bool:
-    """Return True for a list of nodes, False for their number."""
     return isinstance(value, (list, tuple))
 
 
@@ -505,7 +504,6 @@ class Edges(Graph):
         )
 
     def _delivery(self, links: list[Link]) -> dict[Link, float] | None:
-        """Return the delivery probability of each direction of the ``links``, None without any."""
         if self.delivery is None:
             return None
         are_probabilities = ((self.delivery >= 0.0) & (self.delivery <= 1.0)).all()
@@ -522,7 +520,6 @@ class Edges(Graph):
         return delivery
 
     def _positions(self, ids: dict[Any, int]) -> dict[int, tuple[float, float]] | None:
-        """Return the coordinates (x, y) of each node by id, None without any."""
         if self.positions is None:
             return None
         if self.nodes is None or self.positions.shape != (len(ids), 2):
@@ -574,7 +571,6 @@ def assign_ids(labels: Iterable[Any]) -> dict[Any, int]:
 
 
 def _as_integer(label: Any) -> int | None:
-    """Return the node id that a label is, as a number or a text, else None."""
     text = str(label)
     is_id = text.isascii() and text.isdecimal() and len(text) < 17 and str(int(text)) == text
     return int(text) if is_id and int(text) <= 2**53 else None

@@ -43,7 +43,6 @@ class MessageTable:
 
     @cached_property
     def _lengths(self) -> dict[Link, int]:
-        """Number of messages that each direction has in the table."""
         return {link: 1 + max(listed) for link, listed in self.values.items()}
 
     def value(self, link: Link, message: int, after: str) -> float | None:

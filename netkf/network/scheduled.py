@@ -155,10 +155,6 @@ class Hopping(Component):
                 lines.setdefault(key[1], int(table.lines[row]))
         return deliveries, lines
 
-    def channel_of(self, number: Any) -> Any:
-        """Return the channel of message ``number`` of a link, or of many."""
-        return np.array(self.hopping)[np.asarray(number) % len(self.hopping)]
-
     def delivery(self, sent: Transmission) -> Any:
         """Return the probability that the message ``sent`` arrives on its channel."""
         return self._per_hop(sent.link)[np.asarray(sent.number) % len(self.hopping)]

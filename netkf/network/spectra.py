@@ -24,7 +24,6 @@ def largest_laplacian_eigenvalue(degrees: FloatArray, ends: np.ndarray) -> float
 
 
 def _largest_sparse(degrees: FloatArray, ends: np.ndarray) -> float:
-    """Return the largest eigenvalue of the Laplacian of an undirected graph, by Lanczos' method."""
     import scipy.sparse
     import scipy.sparse.linalg
 

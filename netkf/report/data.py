@@ -62,34 +62,10 @@ def run_data(
     instant = worst.time if worst is not None else horizon
     rows = sample_indices(run, budget.values, instant)
     thinned = thin_messages(messages, budget.messages, instant)
-    limits: dict[str, float] = {}
-    if source.promised is not None:
-        limits[source.promised.limit_label] = source.promised.limit
-        limits["centralised filter"] = source.promised.central
-        limits = {name: value for name, value in limits.items() if math.isfinite(value)}
     return {
-        "label": source.label,
-        "name": source.scenario.name,
-        "status": source.status,
-        "replica": run.replica,
-        "words": source.replicas.words(run.replica) if source.replicas else "",
-        "horizon": horizon,
-        "truth": run.truth_known,
-        # In slots, messages that a node sends at the same time are one transmission.
-        "broadcasts": bool(len(run.log)) and (source.scenario.slotted or run.count("transmit") > 0),
-        "n": run.xhat.shape[2],
-        "states": list(source.scenario.state_labels),
-        "read": [source.scenario.what_is_read(node) for node in (*run.nodes, -1)],
-        "nodes": list(run.nodes),
-        "names": [str(node) for node in run.nodes],
-        "sensors": [node for node in run.nodes if node in source.scenario.placed_sensors],
+        **_facts(source, run),
         "positions": layout,
-        "knowledge": source.knowledge,
-        "flow": _flow_kind(source),
-        "continuous": sorted(source.scenario.increment_sensors),
-        "period": source.period,
         "axes": _state_axes(source, run, worst),
-        "links": [list(pair) for pair in source.scenario.topology.directions[:MAX_LINKS]],
         "worst": None if worst is None else worst._asdict(),
         # Half axes of probability ELLIPSE_LEVEL, in standard deviations.
         "scale": {
@@ -108,7 +84,37 @@ def run_data(
             "samples": len(run.times),
             "links": len(source.scenario.topology.directions),
         },
-        "limits": limits,
+    }
+
+
+def _facts(source: ReportSource, run: StoredRun) -> dict[str, Any]:
+    """Return what is known of a run, its scenario and its network without its samples."""
+    limits: dict[str, float] = {}
+    if source.promised is not None:
+        limits[source.promised.limit_label] = source.promised.limit
+        limits["centralised filter"] = source.promised.central
+    return {
+        "label": source.label,
+        "name": source.scenario.name,
+        "status": source.status,
+        "replica": run.replica,
+        "words": source.replicas.words(run.replica) if source.replicas else "",
+        "horizon": float(source.scenario.horizon),
+        "truth": run.truth_known,
+        # In slots, messages that a node sends at the same time are one transmission.
+        "broadcasts": bool(len(run.log)) and (source.scenario.slotted or run.count("transmit") > 0),
+        "n": run.xhat.shape[2],
+        "states": list(source.scenario.state_labels),
+        "read": [source.scenario.what_is_read(node) for node in (*run.nodes, -1)],
+        "nodes": list(run.nodes),
+        "names": [str(node) for node in run.nodes],
+        "sensors": [node for node in run.nodes if node in source.scenario.placed_sensors],
+        "knowledge": source.knowledge,
+        "flow": _flow_kind(source),
+        "continuous": sorted(source.scenario.increment_sensors),
+        "period": source.period,
+        "links": [list(pair) for pair in source.scenario.topology.directions[:MAX_LINKS]],
+        "limits": {name: value for name, value in limits.items() if math.isfinite(value)},
     }
 
 

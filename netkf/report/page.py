@@ -209,7 +209,6 @@ def _assemble_page(
     command: str,
     data_limits: Budget,
 ) -> str:
-    """Return the page of one or two ``entries`` as HTML, within the ``data_limits``."""
     packer = Packer()  # collects columns of numbers as one compressed text
     choices = [
         [_live_data(one, data_limits, packer) for one in (entry, *entry.others)]
@@ -393,7 +392,6 @@ def _result_tables(source: ReportSource) -> str:
 
 
 def _describe_origin(sources: list[ReportSource], command: str, rules: list[str]) -> str:
-    """Return the commands that make the page, versions, counts and ``rules`` as HTML."""
     parts = [paragraph("This page was made by:"), _command_box(command)]
     for source in sources:
         parts.append(paragraph("The results can be computed again by:"))
@@ -447,12 +445,10 @@ def _source_command(source: ReportSource) -> str:
 
 @cache
 def _asset(name: str) -> str:
-    """Return the text of a file in the folder ``assets``."""
     return (resources.files("netkf.report") / "assets" / name).read_text(encoding="utf-8")
 
 
 def _series_css() -> str:
-    """Return the style sheet of SERIES, on a light and a dark page."""
     numbers = range(len(SERIES))
     light, dark = (
         ";".join(f"--series-{k}: {getattr(SERIES[k], of)}" for k in numbers)

@@ -98,7 +98,6 @@ def summary_section(source: ReportSource) -> str:
 
 
 def _bound_notes(source: ReportSource) -> list[str]:
-    """Return notes on what trace P is compared with: bound, limit, and central filter."""
     summary, promised = source.summary, source.promised
     concerned = promised is None or promised.limit_label  # the hybrid paper is about the filter
     notes = [f"bound: {summary['bound']}"] if concerned and not has_bound(summary) else []
@@ -285,7 +284,6 @@ def difference_curves(source_a: ReportSource, source_b: ReportSource) -> dict[st
 
 
 def _matrix_traces(matrices: FloatArray) -> FloatArray:
-    """Return the traces (T, N) of ``matrices`` (T, N, n, n)."""
     return traces(matrices)
 
 

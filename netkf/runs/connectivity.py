@@ -105,7 +105,6 @@ class ConnectivitySink(Sink):
         return up
 
     def _nodes_up(self, t: FloatArray) -> np.ndarray:
-        """Return the nodes (T, N) that are up."""
         up = np.ones((len(t), len(self.nodes_connected)), dtype=bool)
         for node, life in self._lives.items():
             # A change takes effect before the sample of its instant.

@@ -41,7 +41,6 @@ def lock_directory(directory: Path | None, must_be_empty: bool = False) -> Itera
 
 @contextlib.contextmanager
 def _hold_lock(directory: Path) -> Iterator[None]:
-    """Hold the lock of a directory during the body of the ``with`` statement."""
     descriptor = None
     try:
         descriptor = _open_lock_file(directory)

@@ -45,7 +45,6 @@ def check_seal(document: Mapping[str, Any]) -> None:
 
 
 def _digest(document: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a document in hexadecimal; the order of its keys does not matter."""
     text = json.dumps(document, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 

@@ -95,7 +95,6 @@ def _open_for_reading(path: Path) -> Iterator[Any]:
 
 
 def _open_arrow_file(path: Path, mode: str) -> Any:
-    """Open and return an Arrow file, in mode "rb" or "wb"."""
     # The path as bytes: pyarrow encodes a text as UTF-8, which may not be how the system does.
     return pa.OSFile(os.fsencode(path), mode)
 
@@ -103,7 +102,6 @@ def _open_arrow_file(path: Path, mode: str) -> Any:
 def _read_columns(
     file: Any, source: Any, name: str, columns: Sequence[str], run: int | None
 ) -> Any:
-    """Return an Arrow table with the ``columns`` of a Parquet file."""
     if file.metadata.num_rows > MAX_READ_ROWS:
         raise DamagedError(f"{name} has more than {MAX_READ_ROWS:,} rows")
     if run is None:
@@ -173,7 +171,6 @@ class ParquetSink(Sink):
             self._collect_samples()
 
     def _collect_samples(self) -> None:
-        """Make a table of the samples of the present run that were taken."""
         if self._samples:
             samples = StateSamples(*map(np.concatenate, zip(*self._samples, strict=True)))
             self._samples.clear()
@@ -182,7 +179,6 @@ class ParquetSink(Sink):
             self._states.collect(table)
 
     def _flush(self) -> None:
-        """Write all rows that were taken."""
         self._collect_samples()
         self._events.flush()
         self._states.flush()

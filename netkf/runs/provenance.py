@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib
-import json
 import os
 import platform
 from functools import cache
@@ -33,7 +32,6 @@ def versions() -> dict[str, str]:
 
 @cache
 def _cached_versions() -> dict[str, str]:
-    """Return the versions of netkf, Python, packages and BLAS; always the same dictionary."""
     result = {"netkf": __version__, "source": source_digest(), "python": platform.python_version()}
     for package in PACKAGES:
         try:
@@ -67,12 +65,6 @@ def machine() -> dict[str, Any]:
         if name.startswith(VARIABLES) and name not in UNRELATED_VARIABLES
     }
     return {**result, "environment": environment} if environment else result
-
-
-def installation_digest() -> str:
-    """Return the SHA-256 of the software and hardware that last bits depend on."""
-    text = json.dumps([versions(), machine()], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _numpy_build() -> dict[str, Any]:

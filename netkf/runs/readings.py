@@ -84,26 +84,27 @@ def collect_readings(
         run = simulate(dataclasses.replace(scenario, probe=times), seed, replica, engine)
         times = times[: len(run.times)]  # a run that diverges ends early
         states = np.nan_to_num(run.x)
-    origin = np.zeros((len(times), plant.n))
-    responses = scenario.input_responses
-    if responses is not None and responses.believed is not None:
-        slots = np.round(times / plant.period).astype(int) if scenario.slotted else times
-        origin = responses.believed.states(slots)
-    readings = [
-        reading
-        for node, sensors in placed.items()
-        for one in sensors
-        for reading in _readings_of(
-            scenario,
-            streams,
-            (node, one),
-            numbers[node, one.ordinal],
-            np.searchsorted(times, times_of[node, one.ordinal]),
-            states - origin,
-        )
-    ]
+    origin = _known_response(scenario, times)
+    readings: list[SensorReading] = []
+    for node, sensors in placed.items():
+        for one in sensors:
+            key = node, one.ordinal
+            rows = np.searchsorted(times, times_of[key])
+            of_sensor = _readings_of(
+                scenario, streams, (node, one), numbers[key], rows, states - origin
+            )
+            readings += of_sensor
     readings.sort(key=lambda one: one.number)
     return Readings(times, readings, run, origin)
+
+
+def _known_response(scenario: Scenario, times: FloatArray) -> FloatArray:
+    """Return the response (K, n) to the input that filters know at ``times`` (K,)."""
+    responses = scenario.input_responses
+    if responses is None or responses.believed is None:
+        return np.zeros((len(times), scenario.plant.n))
+    slots = np.round(times / scenario.slot_plant.period).astype(int) if scenario.slotted else times
+    return np.asarray(responses.believed.states(slots))
 
 
 def _readings_of(

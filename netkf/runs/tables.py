@@ -101,7 +101,6 @@ def summary_table(
 
 
 def _held_out_lines(rows: list[dict[str, Any]]) -> Iterator[str]:
-    """Yield a line for each of the first nodes with held-out readings."""
     for row in rows[:MAX_HELD_OUT]:
         square, noise, expected = (
             format_number(row[key]) for key in ("mean_square", "noise", "expected")
@@ -162,7 +161,6 @@ def _node_table(summary: dict[str, Any], unit: str) -> Iterator[str]:
 
 
 def _row_cells(name: str, row: dict[str, Any], columns: Iterable[str]) -> list[str]:
-    """Return the cells of a row of averages that begins with ``name``."""
     return [name, *(format_with_error(row[key], row.get(f"{key}_se")) for key in columns)]
 
 

@@ -105,7 +105,6 @@ def _of_blocks(sensor: Any, layout: Layout, topology: Topology) -> Iterator[Any]
 
 
 def _name_of(sensor: Any, layout: Layout) -> str | None:
-    """Return the name of the block that a sensor reads; None if it reads the stacked state."""
     name = getattr(sensor, "of", None)
     if name is not None:
         return str(name)
@@ -169,7 +168,6 @@ def _pairs(sensor: Any, layout: Layout, topology: Topology) -> Iterator[tuple[Pl
 def _targets(
     sensor: Any, topology: Topology, owners: Sequence[int]
 ) -> Iterator[tuple[str, int, int]]:
-    """Yield (key, reader, other) of all that a relative sensor reads."""
     if sensor.record is not None:
         table = sensor.record
         pairs = dict.fromkeys(zip(table.nodes, table.columns.integers("to"), strict=True))

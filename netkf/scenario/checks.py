@@ -224,7 +224,6 @@ def _check_speed(scenario: DerivedScenario) -> None:
 
 
 def _list_ids(nodes: tuple[int, ...]) -> str:
-    """Return node ids as text; of more than eight only the first and the last."""
     return ", ".join(map(str, nodes)) if len(nodes) <= 8 else f"{nodes[0]} .. {nodes[-1]}"
 
 
@@ -576,7 +575,6 @@ def _check_slots(scenario: DerivedScenario) -> None:
 
 
 def _describe_activation(activation: Component) -> str:
-    """Return the kind of an activation, and of a recorded one the form that its columns give it."""
     name = kind_name(activation, "activation")
     if not isinstance(activation, RecordedSlots):
         return name

@@ -219,7 +219,6 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def _node_models(self) -> tuple[Any, ...]:
-        """The first believed models of all nodes."""
         if self.model_views is not None:
             placed = self.placed_sensors if self.slotted else self.increment_sensors
             make = self._slot_model if self.slotted else self._flow_model
@@ -242,7 +241,6 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def _pooled_model(self) -> Any:
-        """The first believed model of a central filter."""
         stacked = self._stack_sensors(self._pooled_sensors, believed=True)
         return self._slot_model(*stacked) if self.slotted else self._flow_model(*stacked)
 

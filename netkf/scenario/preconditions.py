@@ -73,7 +73,6 @@ def _check_one_model(scenario: DerivedScenario, reason: str) -> None:
 
 
 def _check_blocks(scenario: DerivedScenario) -> None:
-    """Check that nodes that estimate some blocks can do so with what they are given."""
     name, talks = filter_name(scenario), scenario.node_filter.timing.talks
     if scenario.node_filter.timing.pooled:
         return

@@ -142,7 +142,6 @@ def _insert_arrays(value: Any, arrays: dict[str, Any]) -> Any:
 
 
 def _nesting_depth(value: Any) -> int:
-    """Return how deep tables and lists are nested, counted up to MAX_DEPTH + 1."""
     # Level by level: recursion would fail for the very values that this is to find.
     depth, level = 0, [value]
     while level and depth <= MAX_DEPTH:

@@ -214,7 +214,6 @@ def _state_times(scenario: DerivedScenario, place: Place) -> FloatArray:
 
 
 def _state_slots(scenario: DerivedScenario, place: Place) -> set[int]:
-    """Return the slots whose states of a block a run needs."""
     slots = {*scenario.sampled_slots}
     if any(is_drawn_from(scenario, sensor, place) for sensor in scenario.sensors):
         slots.update(sensed_slots(scenario))

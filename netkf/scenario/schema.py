@@ -206,7 +206,6 @@ def _family_schema(name: str, families: Sequence[str]) -> Schema:
 
 
 def _block_schema() -> Schema:
-    """Return the schema of one of [[plants]]: its own keys beside those of its plant."""
     own = [key for key in list_keys(Block) if key.name != "plant"]
     plants: list[type[Component]] = [Diffusion, LinearPlant, NonlinearPlant]
     names = {cls: name for name, cls in KINDS["plant"].items()}
@@ -217,7 +216,6 @@ def _block_schema() -> Schema:
 def _kind_schema(
     name: str, cls: type[Component], shared_keys: Sequence[TableKey], is_default: bool
 ) -> Schema:
-    """Return the schema of a table of one name in registry.KINDS, read as an object of ``cls``."""
     kind, choice = split_choice(name)
     constants = {key: {"const": value} for key, value in {"kind": kind, **choice}.items()}
     schema = _table_schema([*list_keys(cls), *shared_keys], constants=constants)

@@ -67,7 +67,6 @@ def _parse_toml_value(text: str) -> Any:
 
 
 def _split_at_commas(text: str) -> list[str]:
-    """Return the items between the commas of a text that are not inside quotes or brackets."""
     items, depth, open_quote = [""], 0, ""
     for character in text:
         if open_quote:

@@ -97,7 +97,6 @@ def _scenario_table(
 
 
 def _block_table(block: Block, stacked: Plant, style: _Style) -> dict[str, Any]:
-    """Return the table of one of [[plants]], with shared values of the ``stacked`` plant."""
     plant = copy.copy(block.plant)
     if style.with_defaults:
         defaults: dict[str, Any] = {"mean": plant.start_mean, "cov": plant.start_cov}

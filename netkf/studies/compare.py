@@ -350,7 +350,6 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
 
 
 def _common_unit(settings: dict[str, str]) -> str:
-    """Return the unit of all states, empty where they have none or several."""
     plants = [m[0] for m in map(PLANT.match, settings) if m]
     texts = {settings.get(f"{plant}units", "['']") for plant in plants}
     units = {unit for text in texts for unit in tomllib.loads(f"units = {text}")["units"]}
@@ -387,7 +386,6 @@ def _compare_quantity(
 def _with_interval(
     entry: Entry, difference: float, error: float, freedom: float, level: float, method: str
 ) -> Entry:
-    """Return the entry with a ``difference`` and Student's interval for it."""
     width = float(scipy.special.stdtrit(freedom, 1.0 - level / 2.0)) * error
     low, high = difference - width, difference + width
     real = math.isfinite(width) and math.isfinite(difference) and (low > 0.0 or high < 0.0)

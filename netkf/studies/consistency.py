@@ -151,7 +151,6 @@ def _block_consistency(
 
 
 def _mean(values: FloatArray, blurred: np.ndarray) -> FloatArray:
-    """Return means (N,) of ``values`` (T, N) over samples not ``blurred``; nan without any."""
     count = (~blurred).sum(axis=0)
     with np.errstate(invalid="ignore"):
         return np.asarray(

@@ -292,7 +292,6 @@ class Why:
             yield f"No newer reading was kept away by {messages} that did not come."
 
     def _smallest_sentences(self) -> Iterator[str]:
-        """Yield the sentences on the smallest set of missing messages; none without P."""
         # The last replay is the one in which no message is missing.
         smallest, no_losses = self.smallest, self.what_ifs[-1]
         if smallest is None:
@@ -375,7 +374,6 @@ class Why:
         return format_table(header, shorten_rows(rows, MAX_ROWS), left_columns=1)
 
     def _age_at_sample(self, seconds: float) -> float:
-        """Return the age in seconds of something at the time of the sample."""
         return seconds if math.isnan(seconds) else max(0.0, self.at - seconds)
 
     def _format_time_before(self, seconds: float) -> str:
@@ -404,7 +402,6 @@ def relative_change(trace: float, base: float) -> str:
 
 
 def _format_time(seconds: float) -> str:
-    """Return seconds as text, "-" for nan."""
     return "-" if math.isnan(seconds) else f"{seconds:.6g}"
 
 
@@ -427,7 +424,6 @@ def _list_items(items: Sequence[object], others: str = "others") -> str:
 
 
 def _join_with_and(parts: Sequence[str]) -> str:
-    """Return parts joined by commas and "and"."""
     if len(parts) < 2:
         return "".join(parts)
     return f"{', '.join(parts[:-1])} and {parts[-1]}"

@@ -63,7 +63,6 @@ def _changes(scenario: Scenario, target: Target, searched: str) -> list[tuple[fl
 
 
 def _candidates(scenario: Scenario) -> list[tuple[str, dict[str, Any], str]]:
-    """Return keys of a scenario with changes that may help, and the new values in words."""
     clock, loss = scenario.network.activation, scenario.network.channel.loss
     algorithm, found = scenario.filter.algorithm, []
     for key, part, name in (

@@ -290,7 +290,6 @@ def _ends_of(stretch: Stretch, times: FloatArray) -> tuple[float, float]:
 
 
 def _unbroken(law: Law, counted: float, is_small: bool) -> str:
-    """Return the verdict on a node whose innovations do not contradict the model."""
     if not law.kind:
         return "not judged"
     if not counted:

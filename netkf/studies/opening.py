@@ -117,7 +117,6 @@ def _read_sweep(folder: Path, scenario: Scenario, manifest: dict[str, Any]) -> S
 
 
 def _read_table(path: Path, keys: tuple[str, ...]) -> pd.DataFrame:
-    """Return the table of a sweep over ``keys``; raises DamagedError."""
     import pandas as pd
 
     names = column_names(path)

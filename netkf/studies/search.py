@@ -283,7 +283,6 @@ class Search:
         return 1.1 * probe.runs * (width / distance) ** 2 if distance > 0.0 else math.inf
 
     def _advise(self, value: float | None, misses: float | None, grows: bool) -> str:
-        """Return advice on a next search; empty if this one was conclusive."""
         by_value = sorted(self.probes)
         if value is not None and misses is None:
             end = by_value[-1] if grows else by_value[0]
@@ -316,7 +315,6 @@ class Search:
         )
 
     def _advise_range(self, end: float, next_end: float) -> str:
-        """Advise to search ``end`` .. ``next_end``, or say why that is impossible."""
         if end == 0.0:
             return ""
         next_end = round(next_end) if self.integer else float(f"{next_end:.2g}")
@@ -328,7 +326,6 @@ class Search:
         return f"next range: --vary {self.key}={low:g}:{high:g}" if low < high else ""
 
     def _advise_runs(self, probe: Probe) -> str:
-        """Return how many runs would decide the ``probe``; empty if it is decided."""
         runs = self._runs_to_decide(probe) if probe.target == UNDECIDED else math.nan
         if math.isnan(runs):
             return ""

@@ -186,7 +186,6 @@ def _true_states(scenario: Scenario, times: FloatArray) -> FloatArray:
 
 
 def _value_or_nan(function: Callable[[], float]) -> float:
-    """Return the value of a function, nan if it is not promised."""
     try:
         return function()
     except TheoryError:

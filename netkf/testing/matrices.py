@@ -39,6 +39,5 @@ def assert_dominated(P: ArrayLike, bound: ArrayLike, tolerance: float = 1e-9) ->
 
 
 def _format_index(index: object) -> str:
-    """Return an index as text, such as "[3, 0]"; empty for a single matrix."""
     numbers = [int(k) for k in index]  # type: ignore[attr-defined]
     return f"[{', '.join(map(str, numbers))}]" if numbers else ""

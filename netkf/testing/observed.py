@@ -237,7 +237,6 @@ class Observed(Filter):
         return self.watched.call("shift", payload, offset)
 
     def _note(self, own: ObservedState, after: str) -> ObservedState:
-        """Check and record the estimate of a node, and return its state."""
         xhat, P = check_estimate(self.watched, own.state, own.H.shape[1], after)
         size = float(np.abs(xhat).max())
         self.log.seen.append(Seen(own.node, after, xhat - self._offset(own), P, size))

@@ -79,7 +79,6 @@ def assumption_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _clock_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows for continuous time: those of the hybrid paper, or of any filter."""
     if not concerns_hybrid_paper(scenario):
         # Of what H assumes, this decides about errors of every filter.
         rows = [*_plant_rows(scenario), *start_rows(scenario, ANY)]
@@ -98,7 +97,6 @@ def _clock_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _weight_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumptions of the filter's paper on its weights, as rows of the table."""
     rows = theory_of(scenario).weight_rows
     return [] if rows is None else rows(scenario)
 

@@ -102,7 +102,6 @@ def _seen_blocks(scenario: Scenario, joint: FloatArray) -> FloatArray:
 
 
 def _joint_moments(scenario: Scenario, run: Run, about_mean: bool) -> FloatArray:
-    """Return the joint covariance (T, N n, N n) of all errors, or their second moments."""
     errors = _errors_of(scenario, run)
     # The generator stops at each sample, when the errors have their values of that time.
     joint = errors.covariance if about_mean else errors.second_moments
@@ -138,7 +137,6 @@ def _errors_of(scenario: Scenario, run: Run) -> ErrorColumns:
 
 
 def _require_known_errors(scenario: Scenario, run: Run) -> None:
-    """Raise TheoryError if ``run`` is not one of the scenario, or its errors are not affine."""
     if not isinstance(run, Run):
         raise TheoryError(
             f"run must be a netkf.Run, as netkf.simulate returns it, got a {type(run).__name__}"

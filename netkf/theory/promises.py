@@ -201,7 +201,6 @@ def promises_text(scenario: Scenario, promises: dict[str, Any]) -> str:
 
 
 def _steady_error_lines(scenario: Scenario, promises: dict[str, Any]) -> list[str]:
-    """Return the line of ``netkf theory`` on the exact steady error covariances of the nodes."""
     if "steady_error" not in promises:
         return []
     error, title = promises["steady_error"], "trace of the steady error covariance, exact"
@@ -217,7 +216,6 @@ def _steady_error_lines(scenario: Scenario, promises: dict[str, Any]) -> list[st
 
 
 def _assumption_lines(rows: list[dict[str, Any]]) -> list[str]:
-    """Return the lines of ``netkf theory`` on the assumptions of the paper."""
     lines = []
     for row in rows:
         lines.append(f"  {MARKS[row['holds']]:7}  {row['assumption']}  [{row['source']}]")
@@ -243,7 +241,6 @@ def _bound_lines(scenario: Scenario, promises: dict[str, Any]) -> list[str]:
 
 
 def _limit_lines(scenario: Scenario, promises: dict[str, Any]) -> list[str]:
-    """Return the lines of ``netkf theory`` on traces to compare P with."""
     labels = {"central_covariance": "centralised filter with all readings"}
     if concerns_hybrid_paper(scenario):
         error_limit = "limit of the true error covariance (derived)" + delay_suffix(scenario)

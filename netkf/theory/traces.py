@@ -92,7 +92,6 @@ def _steady_note(scenario: Scenario) -> str:
 
 
 def _trace_or_nan(function: Any, scenario: Scenario) -> float:
-    """Return the trace of the matrix ``function(scenario)``; nan if it raises TheoryError."""
     try:
         return float(np.trace(function(scenario)))
     except TheoryError:

@@ -76,7 +76,6 @@ def _describe(log: IntArray, row: int) -> str:
 
 
 def _first(wrong: np.ndarray) -> int | None:
-    """Return the index of the first True; None if there is none."""
     return int(np.argmax(wrong)) if wrong.any() else None
 
 

@@ -49,7 +49,6 @@ def files_fault(scenario: Scenario, run: Run, engine: Engine) -> str:
 
 
 def _directory_fault(run: Run, scenario: Scenario, directory: Path) -> str:
-    """Return a fault of the files of ``run`` in a directory."""
     manifest = read_checked_document(directory, "manifest.json", MANIFEST_FORM)
     stored = read_run(directory, scenario, manifest)
     if scenario.views is not None:
@@ -61,7 +60,6 @@ def _directory_fault(run: Run, scenario: Scenario, directory: Path) -> str:
 
 
 def _tables_fault(run: Run, stored: StoredRun) -> str:
-    """Return a fault of the tables and manifest of a ``stored`` run, which should be ``run``."""
     manifest = stored.manifest
     facts = {
         "status": (manifest["status"], run.status),

@@ -95,7 +95,6 @@ class BlockColumns(ErrorColumns):
         return self._filter.init(self._models[h], xhat, cov, self._scenario.node_infos[h])
 
     def _inputs(self, count: int) -> int:
-        """Return the first of ``count`` unused columns."""
         if self._used + count > self._x.shape[1]:
             self._reduce(count)
         first, self._used = self._used, self._used + count

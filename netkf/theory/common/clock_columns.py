@@ -104,7 +104,6 @@ class ClockColumns(LoggedColumns):
         }
 
     def _begin_piece(self, piece: int) -> None:
-        """Take the laws of a piece of the plant, from its first instant on."""
         scenario, plant = self._scenario, cast(Any, self._scenario.plant).pieces[piece]
         if piece < len(scenario.model_pieces):
             self._filters.clocked.begin_piece(piece)
@@ -263,7 +262,6 @@ class ClockColumns(LoggedColumns):
         self._sent[key] = Sent(m, time, h, number, reading)
 
     def _take(self) -> int:
-        """Return a free message."""
         m = self._free.pop()
         self._uses[m] = 1
         return m
@@ -302,7 +300,6 @@ class ClockColumns(LoggedColumns):
                 forms.give(message.reading[1])
 
     def _forms(self) -> FloatArray:
-        """Return the errors (M n, C): the means, and the columns of inputs."""
         table, used = self._forms_of_all.table, self._forms_of_all.used
         estimates = table[self._filters.xhat_rows.reshape(-1), :used]
         return np.asarray(np.tile(table[self._x, :used], (self.estimators, 1)) - estimates)

@@ -95,7 +95,6 @@ class LoggedColumns(ErrorColumns):
         raise NotImplementedError
 
     def _apply(self, *row: Any) -> None:
-        """Do what a row says."""
         raise NotImplementedError
 
     def _move_all(self, time: float) -> None:

@@ -211,7 +211,6 @@ class ClockJumps:
 
 
 def _block_slice(X: FloatArray, nodes: int, i: int) -> FloatArray:
-    """Return the block (S, n, n) of node i of X (S, N n, N n) as a view."""
     n = X.shape[1] // nodes
     return X[:, i * n : (i + 1) * n, i * n : (i + 1) * n]
 

@@ -69,7 +69,6 @@ class SlotColumns(ErrorColumns):
         self._filters = self._begin()
 
     def _observe(self, slot: int) -> dict[int, Observation]:
-        """Return the readings of a slot by estimator."""
         observations = self._all_observations(slot)
         if not len(self._lives.t) and not self._lives.down.any():
             return observations
@@ -132,7 +131,6 @@ class SlotColumns(ErrorColumns):
             yield
 
     def _move_truth(self, slot: int) -> None:
-        """Move the true state from ``slot`` to the next one."""
         F, noise = self._laws[bisect.bisect_right(self._scenario.slot_plant.change_slots, slot)]
         self._x = np.column_stack([F @ self._x, noise])
         if self._scenario.surprise is not None:
@@ -156,7 +154,6 @@ class SlotColumns(ErrorColumns):
     def _simulate(
         self, slot: int, observations: dict[int, Observation], arrivals: dict[int, np.ndarray]
     ) -> None:
-        """Simulate a slot: each reading has a column for its noise."""
         setup, n = self._setup, self.n
         first = self._x.shape[1]
         columns = first + sum(o.root.shape[1] for o in observations.values())
@@ -212,7 +209,6 @@ class SlotColumns(ErrorColumns):
             self._x[:] = 0.0
 
     def _compress(self) -> None:
-        """Turn the columns of noises into as few as their rank allows."""
         columns = self._x.shape[1]
         linear = {}
         for name, array in self._filters.records.arrays.items():
@@ -259,7 +255,6 @@ class SlotColumns(ErrorColumns):
         return np.asarray(S @ np.swapaxes(S, 1, 2))
 
     def _matrix(self, name: str) -> FloatArray:
-        """Return an array of the filters as a matrix (entries, C)."""
         array = self._filters.records.arrays[name]
         entries = array.transpose(*range(1, array.ndim - 1), 0, array.ndim - 1)
         return entries.reshape(-1, len(array) * LANES)[:, : self._x.shape[1]]

@@ -96,7 +96,6 @@ def clock_jumps(scenario: Scenario) -> ClockJumps | DelayedJumps | SlotJumps:
 
 
 def _node_slice(k: int, n: int) -> slice:
-    """Return the rows of the node with index ``k`` in stacked errors (N n,)."""
     return slice(k * n, (k + 1) * n)
 
 

@@ -77,7 +77,6 @@ def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
 
 
 def _bound_over_pieces(scenario: Scenario, times: FloatArray) -> FloatArray:
-    """Return the bound (T, N, n, n) of a plant that changes, piece after piece."""
     edges, bounds = [0.0, *scenario.plant.changes.tolist(), math.inf], []
     cov: tuple[FloatArray, ...] | None = None
     for k, (start, end) in enumerate(itertools.pairwise(edges)):
@@ -255,7 +254,6 @@ class _PiecewiseSolution:
         return min(last, begin + max(delay, 0.5 / max(inflow, 1e-300)))
 
     def _append(self, end: float, output: Callable[[float], FloatArray]) -> None:
-        """Add a piece until ``end`` (seconds) with its dense ``output``."""
         self._outputs.append(output)
         self._piece_ends.append(end)
         self._start_value = output(end).reshape(self._packed.start.shape)

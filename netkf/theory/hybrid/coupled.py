@@ -218,7 +218,6 @@ def has_balanced_rates(scenario: Scenario) -> bool | None:
 
 
 def _is_symmetric(c: scipy.sparse.csr_array) -> bool:
-    """Return True if the rates c (N, N), per second, are symmetric up to rounding."""
     difference, size = abs(c - c.T), abs(c.T)
     return bool(difference.max() <= EQUAL_RATES * size.max())
 

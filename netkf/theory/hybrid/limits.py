@@ -54,7 +54,6 @@ def limit_covariance(scenario: Scenario) -> FloatArray:
 
 
 def _require_limit(scenario: Scenario) -> None:
-    """Raise TheoryError for filters and clocks that H(13) is not about."""
     algorithm = scenario.filter.algorithm
     if not algorithm.timing.talks:
         return

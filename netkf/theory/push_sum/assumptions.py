@@ -89,7 +89,6 @@ def _joint_failure_row(scenario: Scenario, law: Averaging | None) -> AssumptionR
 
 
 def _connection_row(scenario: Scenario) -> AssumptionRow:
-    """Return the row that links which are up may connect all nodes: p_d below 1."""
     name, source = "p_d < 1: the network is whole at times", "P Assumption 3"
     try:
         cut = disconnection_probability(scenario)
@@ -121,7 +120,6 @@ def _gain_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _stop_row(scenario: Scenario) -> AssumptionRow:
-    """Return the row that ``stop`` freezes no gain before push-sum has converged."""
     filter_ = push_sum_filter(scenario)
     lossless = isinstance(scenario.network.activation, Broadcast) and all(
         scenario.mean_delivery(direction) == 1.0
@@ -161,7 +159,6 @@ def _moment_rows(scenario: Scenario) -> list[AssumptionRow]:
 def _exact_row(
     name: tuple[str, str], measure: Callable[[], float], heavy: bool = False
 ) -> AssumptionRow:
-    """Return the row that holds if the radius that ``measure`` computes is below 1."""
     try:
         radius = measure()
     except TheoryError as error:
@@ -177,7 +174,6 @@ def _exact_row(
 
 
 def _certified_row(scenario: Scenario, moment: Moment, source: str) -> AssumptionRow:
-    """Return the row that gamma is certified by the theorem ``source`` for this ``moment``."""
     gamma = push_sum_filter(scenario).gamma
     name = f"gamma is certified for the {moment.replace('-', ' ')}"
     try:

@@ -87,7 +87,6 @@ def _bound_constants(scenario: Scenario) -> GammaConstants:
 
 
 def _require_conditions(scenario: Scenario, law: Averaging, P: FloatArray) -> None:
-    """Raise TheoryError if a condition of P Theorems 5 and 6 fails."""
     laplacian_radius = consensus_gain_bound(scenario).radius
     if not law.delta > laplacian_radius:
         raise TheoryError(
@@ -159,7 +158,6 @@ def corollary_2(scenario: Scenario, sharp: bool = False) -> CorollaryTwo:
 
 
 def _check_moment(moment: str) -> Moment:
-    """Return "mean" or "mean-square"; raises TheoryError for other names."""
     if moment not in ("mean", "mean-square"):
         raise TheoryError(f'moment must be "mean" or "mean-square", got {moment!r}')
     return "mean" if moment == "mean" else "mean-square"

@@ -93,7 +93,6 @@ def _scenario_probability(scenario: Scenario, seed: int, samples: int | None) ->
 def _probability(
     nodes: int, probabilities: dict[tuple[int, int], float], seed: int, samples: int | None
 ) -> Probability:
-    """Return p_d: exact with few enough partitions, else estimated from ``samples`` draws."""
     neighbours: list[dict[int, float]] = [{} for _ in range(nodes)]
     for (i, j), p in probabilities.items():
         if p > 0.0:
@@ -154,7 +153,6 @@ def _read_graph(graph: Any) -> tuple[list[Any], list[Edge], bool]:
 
 
 def _link_probability(link: Edge, delivery: float | Mapping[Edge, float] | None) -> float:
-    """Return the probability that a ``link`` is up; raises TheoryError."""
     p: Any = None
     if isinstance(delivery, Mapping):
         p = delivery.get(link, delivery.get(link[::-1]))

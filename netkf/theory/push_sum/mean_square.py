@@ -258,7 +258,6 @@ def push_sum_covariances(scenario: Scenario, gammas: Sequence[int]) -> FloatArra
 
 
 def _require_averaging(scenario: Scenario, steps: EstimationSteps) -> None:
-    """Raise TheoryError unless averaging converges to the mean, as P Theorem 4 assumes."""
     law = steps.averaging
     if law.held and not law.deterministic:
         raise TheoryError('P Theorem 4 needs links = "fresh": a draw that is held cuts the network')
