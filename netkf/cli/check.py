@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from netkf.cli import pictures
-from netkf.cli.options import FAILED, load_scenario, print_json, print_notes
+from netkf.cli.options import FAILED, load_scenario, pool_settings, print_json, print_notes
 from netkf.cli.progress import ProgressLine
 from netkf.core.errors import ScenarioError
 
@@ -71,9 +71,7 @@ def _run_check(scenario: Scenario, options: argparse.Namespace, earlier: Verdict
             scenario,
             options.runs,
             confidence=options.confidence,
-            workers=options.workers,
-            executor=options.executor,
-            scheduler=options.scheduler,
+            **pool_settings(options),
             progress=line.make_count_update("runs"),
             until=options.until,
             most=options.most or MAX_LOOKED_RUNS,

@@ -8,7 +8,7 @@ import re
 from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 from netkf.core.errors import quote
 from netkf.core.printable import MAX_NAME
@@ -91,11 +91,14 @@ def _flag(name: str, text: str) -> Option:
     return _option(name, text, action="store_true")
 
 
+def _refuse(rule: str, text: str) -> NoReturn:
+    raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
+
+
 def _integer(text: str, least: int, largest: int) -> int:
     # Twenty digits suffice to compare: Python refuses to convert texts of thousands.
     if not text.isdecimal() or not least <= int(text[:20]) <= largest:
-        rule = f"must be an integer of at least {least} and at most {largest:,}"
-        raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
+        _refuse(f"must be an integer of at least {least} and at most {largest:,}", text)
     return int(text)
 
 
@@ -112,16 +115,14 @@ def parse_workers(text: str) -> int:
 def parse_seed(text: str) -> int:
     """Return the value of ``--seed``; raises ArgumentTypeError for any text but digits."""
     if not text.isdecimal() or len(text) > 30:
-        rule = "must be a non-negative integer of at most 30 digits"
-        raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
+        _refuse("must be a non-negative integer of at most 30 digits", text)
     return int(text)
 
 
 def parse_replica(text: str) -> int:
     """Return the value of ``--replica``; raises ArgumentTypeError."""
     if not text.isdecimal() or len(text) > 12:
-        rule = "must be an integer of at least 0"
-        raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
+        _refuse("must be an integer of at least 0", text)
     return int(text)
 
 
@@ -129,17 +130,15 @@ def parse_replica_or_rank(text: str) -> int | str:
     """Return the value of ``--replica`` of a page; raises ArgumentTypeError."""
     if text in ("worst", "median"):
         return text
-    if text.isdecimal():
-        return parse_replica(text)
-    rule = "must be an integer of at least 0, worst or median"
-    raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
+    if not text.isdecimal():
+        _refuse("must be an integer of at least 0, worst or median", text)
+    return parse_replica(text)
 
 
 def parse_node(text: str) -> str:
     """Return the id or the name of a node; raises ArgumentTypeError for a text that is neither."""
     if not text.strip() or len(text) > MAX_NAME:
-        rule = f"must be the id or the name of a node, of at most {MAX_NAME} characters"
-        raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
+        _refuse(f"must be the id or the name of a node, of at most {MAX_NAME} characters", text)
     return text.strip()
 
 
@@ -149,8 +148,7 @@ def parse_part(text: str) -> tuple[int, int]:
     if not (index.isdecimal() and count.isdecimal() and len(text) < 20) or not (
         int(index) <= int(count) > 0
     ):
-        rule = "must be i/n, part i of n, such as 3/64"
-        raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
+        _refuse("must be i/n, part i of n, such as 3/64", text)
     return int(index), int(count)
 
 

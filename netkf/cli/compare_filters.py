@@ -5,7 +5,13 @@ from __future__ import annotations
 import argparse
 
 from netkf.cli import pictures
-from netkf.cli.options import load_scenario, print_json, print_table_notes, print_title
+from netkf.cli.options import (
+    load_scenario,
+    pool_settings,
+    print_json,
+    print_table_notes,
+    print_title,
+)
 from netkf.cli.progress import ProgressLine
 
 
@@ -29,10 +35,7 @@ def _compare(options: argparse.Namespace) -> int:
             filters,
             options.runs,
             confidence=options.confidence,
-            engine=options.engine,
-            workers=options.workers,
-            executor=options.executor,
-            scheduler=options.scheduler,
+            **pool_settings(options),
             progress=line.make_count_update("filters"),
         )
     print_table_notes(scenario)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from netkf.cli.options import FAILED, load_scenario, print_json, print_table_notes
+from netkf.cli.options import FAILED, load_scenario, pool_settings, print_json, print_table_notes
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -14,12 +14,7 @@ def _run(options: argparse.Namespace) -> int:
 
     scenario = load_scenario(options)
     result = consistency(
-        scenario,
-        options.runs,
-        confidence=options.confidence,
-        workers=options.workers,
-        scheduler=options.scheduler,
-        engine=options.engine,
+        scenario, options.runs, confidence=options.confidence, **pool_settings(options)
     )
     print_table_notes(scenario)
     if options.json:

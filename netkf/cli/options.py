@@ -78,6 +78,12 @@ def load_scenario(
     return loaded
 
 
+def pool_settings(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the keywords of a study that say where and by which engine runs are simulated."""
+    names = ("engine", "workers", "executor", "scheduler")
+    return {name: getattr(options, name) for name in names if hasattr(options, name)}
+
+
 def print_notes(notes: Sequence[str]) -> None:
     """Print notes on standard error, one per line."""
     for note in notes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from netkf.cli.options import FAILED, load_scenario, print_json, print_table_notes
+from netkf.cli.options import FAILED, load_scenario, pool_settings, print_json, print_table_notes
 from netkf.cli.progress import ProgressLine
 from netkf.core.errors import ScenarioError
 
@@ -30,10 +30,7 @@ def _run(options: argparse.Namespace) -> int:
             options.by,
             options.runs,
             options.confidence,
-            workers=options.workers,
-            executor=options.executor,
-            scheduler=options.scheduler,
-            engine=options.engine,
+            **pool_settings(options),
             progress=line.report,
         )
     print_table_notes(scenario)
