@@ -76,7 +76,6 @@ def verdict_picture(path: Path, verdict: Verdict, claim: str) -> bool:
 
 
 def _draw_row(axes: Any, height: int, row: Evidence) -> None:
-    """Draw the row of one promise at height ``height``."""
     # The interval low, high of a row is of the margin, which is minus the distance.
     mark, unit = MARKS.get(row.verdict, OTHER), row.tolerance
     low, high = max(0.0, -row.high) / unit, min(max(0.0, -row.low) / unit, 2.0 * FURTHEST)

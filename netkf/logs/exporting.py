@@ -69,7 +69,6 @@ def export_recorded(run: Run, out: str | Path) -> tuple[Path, ...]:
 
 
 def _new_folder(run: Run, out: str | Path) -> tuple[Path, Scenario]:
-    """Return the folder and the scenario of the run; raises ScenarioError."""
     folder, scenario = as_path("out", out), require_run(run)
     if folder.exists() and any(folder.iterdir() if folder.is_dir() else [folder]):
         rule = "must be a new or empty folder"

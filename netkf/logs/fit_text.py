@@ -51,7 +51,6 @@ def _lines(fit: LogFit) -> Iterator[str]:
 
 
 def _text(table: pd.DataFrame, headings: Mapping[str, str], left: int) -> str:
-    """Return the columns of a table with these headings as text, and an empty line."""
     cells = [
         [value if isinstance(value, str) else format_number(value) for value in row]
         for row in table[[*headings]].to_numpy().tolist()

@@ -75,7 +75,6 @@ def read_mercator(log: Path) -> PacketLog:
 
 
 def _read(path: Path, notes: list[str]) -> tuple[pd.DataFrame, list[Decimal]]:
-    """Return the usable rows of a file, and their stamps."""
     raw = read_texts(path)
     missing = [name for name in COLUMNS if name not in raw.columns]
     if missing:

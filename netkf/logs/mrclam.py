@@ -151,7 +151,6 @@ def _is_number(text: str) -> bool:
 
 
 def _read_by_key(path: Path, columns: Sequence[str], key: str) -> dict[float, list[float]]:
-    """Return the rows of a file as numbers, by that in the column ``key``."""
     table = _read(path, columns).astype(float)
     again = table.index[table[key].duplicated()]
     if len(again):
@@ -202,7 +201,6 @@ def _by_time(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _numbers(table: pd.DataFrame, *names: str) -> FloatArray:
-    """Return the columns of these names in rows."""
     return np.asarray(table[[*names]].astype(float)).T
 
 

@@ -110,7 +110,6 @@ def read_tables(log: Path, columns: Mapping[str, str]) -> PacketLog:
 
 
 def _packet_paths(log: Path) -> list[Path]:
-    """Return the tables of packets of a log; raises ScenarioError if there is none."""
     if not log.is_dir():
         return [log]
     found = [p for ending in ("csv", "csv.gz", "tsv", "txt") for p in log.glob(f"*.{ending}")]

@@ -75,7 +75,6 @@ def _states(make: Any, stamps: list[Any], *columns: FloatArray) -> list[Any]:
 
 
 def _detections(run: Run, start: datetime.datetime | None) -> set[Any]:
-    """Return a detection for each reading of the run, with its model of the whole state."""
     scenario = run.scenario
     placed = scenario.placed_sensors if scenario.slotted else scenario.sampled_sensors
     engine = run.engine if run.engine in ENGINES else "auto"

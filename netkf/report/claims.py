@@ -452,5 +452,4 @@ def _rms_error(row: ComparedFilter) -> Quantity:
 
 
 def _format_time(seconds: float) -> str:
-    """Return a time as text, such as ``t = 2.5 s``."""
     return f"t = {seconds:.6g} s"

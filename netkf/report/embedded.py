@@ -59,7 +59,6 @@ def page(result: Any, other: Any = None, *, replica: int | str | None = None) ->
 
 
 def _write(result: Run | Ensemble, directory: Path) -> Path:
-    """Write a run or an ensemble in memory to a new ``directory`` and return that."""
     if isinstance(result, Run):
         return save(result, result.scenario, directory)
     assert result.scenario is not None

@@ -51,7 +51,6 @@ def explain_worst(source: ReportSource) -> Why | str | None:
 
 
 def _why_command(source: ReportSource, worst: WorstSample) -> str:
-    """Return the command line of ``netkf why`` that explains the worst sample."""
     return f"netkf why {source.label} --node {worst.node} --at {worst.time:.10g}"
 
 

@@ -108,7 +108,6 @@ def _solve(scenario: Scenario) -> tuple[float, FloatArray | None]:
 
 @lru_cache(maxsize=8)
 def _make_system(scenario: Scenario) -> LinearErrors:
-    """Return the errors as a linear system with jumps, cached; raises TheoryError."""
     system = linear_errors(scenario)
     _require_size(system.shape)
     return system
@@ -164,7 +163,6 @@ def is_quickly_solved(scenario: Scenario) -> bool:
 def _choose_solver(
     scenario: Scenario,
 ) -> Callable[[Scenario], tuple[float, FloatArray | None]] | None:
-    """Return the special solver of the filter's paper, or None."""
     is_exact = scenario.node_filter.analysis.P_by_design[0] == "equal"
     return theory_of(scenario).steady_slots if scenario.slotted and is_exact else None
 

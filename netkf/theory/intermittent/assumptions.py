@@ -122,7 +122,6 @@ def _bounded_mean_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _deliveries(scenario: Scenario, heard: list[tuple[int, int]]) -> list[float]:
-    """Return the mean delivery probability of each link of ``heard``."""
     return [scenario.mean_delivery(link) for link in heard]
 
 
