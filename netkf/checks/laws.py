@@ -117,10 +117,9 @@ def pool(
 
 
 def compare_laws(pairs: Sequence[Pair], level: float, start: float = 0.0) -> Finding:
-    """Test that both samples of each pair have the same law within LAW_TOLERANCE, by a
-    Kolmogorov-Smirnov distance for each diagonal entry; all together err with at most the
-    probability ``level``. ``start`` is the largest trace at 0, whose rounding remains in P. It is
-    ``early`` if a limit law is not reached.
+    """Test that samples of each pair have one law within LAW_TOLERANCE: Kolmogorov-Smirnov by
+    diagonal entry. Roundings of ``start``, the largest trace at 0, remain in P. It is ``early`` if
+    a limit law is not reached.
     """
     single_level, early = level / sum(pair.first.shape[-1] for pair in pairs), False
     intervals = []
@@ -196,10 +195,8 @@ def compare_growth(
 def compare_chi_square(
     ratios: FloatArray, freedom: Sequence[float], labels: Sequence[str], level: float, name: str
 ) -> Finding:
-    """Test that squares over their degrees of freedom, ``ratios`` (R, K), have mean 1: the sum of
-    column k is chi-square with ``freedom[k]`` degrees. Columns that are not finite are left out;
-    the others err with at most the probability ``level``. ``labels`` (K) name columns, ``name`` the
-    squares.
+    """Test that squares over their degrees of freedom, ``ratios`` (R, K), have mean 1: sums of
+    columns are chi-square with ``freedom[k]`` degrees, without those that are not finite.
     """
     finite = np.flatnonzero(np.isfinite(ratios).all(axis=0))
     if not len(finite):

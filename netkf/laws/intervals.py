@@ -122,13 +122,11 @@ def student_interval(value: float, deviation: float, count: float, level: float)
 
 def interval_of_squares(values: FloatArray, level: float) -> tuple[float, float]:
     """Return an interval for the mean of sums of squares of Gaussian numbers, such as NEES, from
-    ``values`` (R,) of independent runs. Such sums are skewed, and Student's interval of few of them
-    misses far too often.
+    ``values`` (R,) of runs, which are too skewed for Student's.
 
     Their cube roots are nearly normal, with mean ``m - v / m`` and variance v where m^3 is the mean
-    (Wilson and Hilferty, PNAS 17, 1931). The factor below makes the interval hold from 10 runs on
-    for sums of one degree of freedom too, by simulation: it misses with about the probability
-    ``level`` at most.
+    (Wilson and Hilferty, PNAS 17, 1931). The factor below makes it hold from 10 runs on for sums of
+    one degree of freedom too, by simulation.
     """
     count, roots = len(values), np.cbrt(values)
     centre, variance = float(roots.mean()), float(roots.var(ddof=1))

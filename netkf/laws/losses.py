@@ -275,10 +275,8 @@ def compare_independence(law: LossLaw, counts: LossCounts, level: float) -> Comp
 
 
 def neighbours_variance(p: Any) -> Any:
-    """Return the variance, divided by the number of pairs, of the number of neighbouring pairs in
-    which both events occur, in a long series of independent events of probability p.
-
-    It is Var(x_k x_{k+1}) + 2 Cov(x_k x_{k+1}, x_{k+1} x_{k+2}): overlapping pairs share an event.
+    """Return the variance, by pair, of the number of neighbouring pairs of independent events of
+    probability p in which both occur: Var(x_k x_{k+1}) + 2 Cov(x_k x_{k+1}, x_{k+1} x_{k+2}).
     """
     return p**2 * (1.0 - p**2) + 2.0 * p**3 * (1.0 - p)
 
@@ -359,12 +357,9 @@ def mean_correlation(excess: FloatArray, variance: FloatArray, level: float) -> 
 def compare_matchings(
     p: FloatArray, counts: PairCounts, links: Sequence[tuple[int, int]], level: float
 ) -> Comparison:
-    """Compare matchings of R runs with the stated probability ``p`` (L,) that each of L ``links``
-    is paired in a slot, independently of other slots.
-
-    Compared are the number of pairs in a slot (Student's interval over the runs), with a third of
-    ``level``, and for each link the probability that it is paired (Clopper and Pearson), and its
-    correlation with itself in the next slot.
+    """Compare matchings of R runs with ``p`` (L,) of each link in a slot, independent of other
+    slots: the number of pairs in a slot by Student's interval, for each link its probability by
+    Clopper and Pearson, and its correlation with the next slot.
     """
     slots, runs = float(counts.slots[0]), len(counts.paired)
     single_level = level / (3.0 * len(p))
@@ -397,11 +392,9 @@ def compare_matchings(
 def compare_coincidences(
     events: np.ndarray, lags: Sequence[int], labels: Sequence[str], level: float
 ) -> Comparison:
-    """Compare how often two of L events happen ``lags`` steps apart with what independent ones of
-    their frequencies would do, from ``events`` (R, K, L), 0 or 1: R runs of K steps.
-
-    Limits are those of Clopper and Pearson, shared among all pairs; each lag gives the pair that is
-    least likely.
+    """Compare how often two of L events are ``lags`` steps apart, by ``events`` (R, K, L), 0 or 1,
+    with independent ones of their frequencies: by Clopper and Pearson, shared among all pairs; each
+    lag gives the pair that is least likely.
     """
     p, size = events.mean(axis=(0, 1)), events.shape[2]
     expected, distances = np.minimum(np.outer(p, p), 1.0), []

@@ -101,12 +101,9 @@ def moment_law(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, Fl
 def compare_variances(
     z: FloatArray, labels: Sequence[str], level: float, noun: str, gaussian: bool = True
 ) -> Comparison:
-    """Compare the variances of noises with 1: of all entries pooled, all in each part of a run, and
-    one by one, with a third of ``level`` for each.
-
-    Sums of squares of Gaussian numbers are chi-square. Otherwise (``gaussian`` false) the degrees
-    of freedom of the chi-square law are those that match the variance of the sum, from the sample
-    kurtosis. ``labels`` and ``noun`` name the entries.
+    """Compare the variances of noises with 1: of all entries, in each part of a run, and one by
+    one, with a third of ``level`` for each. Sums of squares are chi-square; unless ``gaussian``
+    with the degrees of freedom that match their variance, from the sample kurtosis.
     """
     counts, squares = np.isfinite(z).sum(axis=(0, 1)), np.nan_to_num(z) ** 2
     min_count = MIN_COUNT if gaussian else MIN_COUNT_OF_ANY_LAW
@@ -151,9 +148,8 @@ def compare_means(
     z: FloatArray, labels: Sequence[str], level: float, states: FloatArray | None = None
 ) -> Comparison:
     """Compare the means of noises with 0, and their correlations with the ``states`` (R, 2, n, d)
-    to which they are added (:class:`NoiseDraws`), with half of ``level`` each if these are known.
-
-    The mean of ``count`` entries of variance 1 is taken to be normal with variance 1 / count.
+    to which they are added, with half of ``level`` each; means of ``count`` entries have variance 1
+    / count.
     """
     counts = np.isfinite(z).sum(axis=(0, 1))
     if counts.max(initial=0) < MIN_COUNT:

@@ -49,12 +49,9 @@ def _own_statements(part: Any, family: str) -> set[str]:
 
 
 def stated_part(part: Any, family: str) -> Any:
-    """Return the object whose stated law (rate, loss probability, covariance, ...) a clock,
-    channel, plant or sensor ``part`` is tested against.
-
-    It is the part itself if its class is built in, derives from no built-in class, or overrides one
-    of the STATEMENTS of its ``family`` (kind of part, such as "loss"); otherwise an instance of the
-    built-in base class with the same fields.
+    """Return the object whose law a clock, channel, plant or sensor is tested against: the ``part``
+    if its class is built in, derives from no built-in class, or overrides one of the STATEMENTS of
+    its ``family``; else its built-in base class with the same fields.
     """
     built_in, ancestors = set(KINDS[family].values()), type(part).__mro__
     base = next((cls for cls in ancestors if cls in built_in), type(part))
@@ -63,10 +60,9 @@ def stated_part(part: Any, family: str) -> Any:
 
 
 def stated_law(part: Any, family: str) -> Any:
-    """Return the law that a clock (``gaps``), loss (``chain``) or delay (``law``) states.
-
-    Where a user's class overrides another of the STATEMENTS, what it inherits is the law of another
-    class: then the default of the contract, which follows from these statements, holds.
+    """Return the ``gaps`` of a clock, ``chain`` of a loss or ``law`` of a delay; where a user's
+    class overrides another of the STATEMENTS the default, since what it inherits is of another
+    class.
     """
     stated, name = stated_part(part, family), STATEMENTS[family][-1]
     own = _own_statements(stated, family)

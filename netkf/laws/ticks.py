@@ -180,13 +180,10 @@ def _distance_from_lattice(law: Lattice, ticks: TickSeries) -> float:
 
 
 def slack_of_start(group: ClockGroup, counts: np.ndarray) -> FloatArray:
-    """Return the slack (E,) in ticks by which the mean count of each clock in a run of T seconds
-    may differ from rate T although its rate is right.
-
-    A renewal process that starts with the run has a mean number of ticks between rate T - 1 and
-    rate T + c^2 in T seconds, with c the coefficient of variation of its gaps (Lorden 1970). Where
-    the law of the gaps is unknown, c^2 is estimated by the dispersion index (variance over mean) of
-    the ``counts`` (R, E), which tends to c^2 for long runs.
+    """Return by how many ticks (E,) mean counts in a run of T seconds may differ from rate T though
+    the rate is right: a renewal process has between rate T - 1 and rate T + c^2, c the coefficient
+    of variation of its gaps (Lorden 1970). An unknown c^2 is the dispersion index of ``counts`` (R,
+    E).
     """
     from_counts = SPREAD * counts.var(axis=0, ddof=1) / np.maximum(counts.mean(axis=0), 1e-300)
     slack = np.where(np.isnan(group.spreads), from_counts, group.spreads)
@@ -196,10 +193,8 @@ def slack_of_start(group: ClockGroup, counts: np.ndarray) -> FloatArray:
 def rates_of_all(
     group: ClockGroup, windows: np.ndarray, slack: float, horizon: float, level: float
 ) -> list[tuple[Interval, str]]:
-    """Return labelled intervals for the relative error of the total rate of all clocks, in the
-    whole run at ``level`` and, of Poisson clocks, in each of its windows at ``level`` together.
-
-    ``windows`` (R, W, E) are the ticks of R runs of ``horizon`` seconds.
+    """Return labelled intervals of the relative error of the total rate, in the whole run at
+    ``level`` and, of Poisson clocks, in each of its ``windows`` (R, W, E) at ``level`` together.
     """
     mean, count, total = float(group.rates.sum()) * horizon, windows.shape[1], windows.sum(axis=2)
     whole = count_interval(total.sum(axis=1), mean, level, group.poisson, slack)
@@ -236,12 +231,8 @@ def smallest_error(ticks: float, level: float) -> float:
 def count_interval(
     values: np.ndarray, mean: float, level: float, poisson: bool, slack: float
 ) -> Interval:
-    """Return an interval for |E(count) / mean - 1|, from the counts ``values`` (R,) of R runs, that
-    misses with probability ``level``.
-
-    Sums of ``poisson`` counts are Poisson and have exact limits. For other clocks Student's
-    interval uses the spread of the counts, and ``slack``, that of the transient at the start of a
-    run in ticks, is subtracted from the distance.
+    """Return an interval for |E(count) / mean - 1| from ``values`` (R,) of R runs: exact for
+    ``poisson`` counts, else Student's, less the ``slack`` of the start of a run in ticks.
     """
     total, runs = float(values.sum()), len(values)
     expected_total = runs * mean
@@ -322,11 +313,11 @@ def largest_correlation(
 
 
 def correlation_of_columns(products: FloatArray, variances: FloatArray, level: float) -> Interval:
-    """Return Student's interval for a correlation from K ``products`` (K,) of independent values
-    of mean 0, and the ``variances`` (K,) of these products without correlation.
+    """Return Student's interval for a correlation from K ``products`` of values of mean 0, with
+    ``variances`` (K,) without correlation.
 
-    Rare events that coincide are counted as a Poisson variable: of a correlation r its mean exceeds
-    that without correlation, lambda, by r times ``scale``, and its deviation is that of the sum.
+    Rare events that coincide are a Poisson variable: of a correlation r its mean exceeds that
+    without, lambda, by r times ``scale``, and its deviation is that of the sum.
     """
     scale, expected = float(np.sqrt(variances).sum()), float(variances.sum())
     # The effective number of rows, those of small variances counting less.

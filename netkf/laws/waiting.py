@@ -88,12 +88,11 @@ def fill_in(ranks: Ranks) -> FloatArray:
 
 
 def correlate_neighbours(ranks: Ranks, first: np.ndarray) -> FloatArray:
-    """Return the sums (3,) from which it is tested that successive waiting times are independent:
-    over neighbours u, v of a series, as standard normal numbers, those of u v and of
-    (u^2 + v^2) / 2, and their number.
+    """Return sums (3,) over neighbouring ranks u, v as normal numbers: of u v, of (u^2 + v^2) / 2,
+    and 1.
 
-    Ranks that are nan are left out, and pairs of one marked as ``first`` (K,) of its series with
-    the one before. A rank beyond the known parts counts as the mean of what is beyond.
+    Pairs with nan, or with the ``first`` (K,) of a series, are left out; a rank beyond the known
+    parts counts as the mean of what is beyond.
     """
     limit = np.clip(ranks.known / CELLS, 1e-12, 1.0 - 1e-12)
     density = np.exp(-0.5 * scipy.special.ndtri(limit) ** 2) / math.sqrt(2.0 * math.pi)

@@ -171,11 +171,11 @@ def choose_origin(stamps: list[Decimal], resolution: float) -> Decimal:
 
 
 def unwrap(numbers: np.ndarray, times: FloatArray) -> tuple[np.ndarray, int, int, int]:
-    """Return counters (K,) of one sender, in the order of ``times`` (K,), that grow on where the
-    ``numbers`` begin again; how often they wrapped, by which modulus, and how often they restarted.
+    """Return counters (K,) of one sender, by ``times``, that grow on where ``numbers`` begin again;
+    how often they wrapped, by which modulus, and how often they restarted.
 
-    A number that falls, and whose successors stay down, wrapped if the numbers skipped by then fit
-    the time that passed, and restarted otherwise; one that falls alone is out of order.
+    A number that falls, with successors that stay down, wrapped if the skipped numbers fit the time
+    passed, and else restarted; one that falls alone is out of order.
     """
     modulus = next((m for m in MODULI if m > numbers.max(initial=0)), 0)
     steps, gaps = np.diff(numbers), np.diff(times)

@@ -35,15 +35,13 @@ def export_graphml(run: Run, out: str | Path) -> tuple[Path, ...]:
 
 
 def carried_network(run: Run) -> networkx.Graph[Any]:
-    """Return the network of a run as a networkx graph, whose nodes are ids, or names where nodes
-    have these.
+    """Return the network of a run as a networkx graph of ids, or names.
 
-    Nodes have ``sensors`` (their number) and, where they stay at one place, ``x`` and ``y``. Links
-    have the numbers of messages ``sent``, ``delivered``, ``lost`` and ``late``, from source to
-    target, ``mean_age`` in seconds of those that came, and ``delivery_probability`` if the graph
-    has a table of it. Undirected links have the same of the other direction, as ``sent_back`` and
-    so on; a table that says something else of that makes the graph a directed one, a link for each
-    direction. Where links follow the positions of nodes, those that carried something are there.
+    Nodes have ``sensors`` (their number) and, if they stay, ``x`` and ``y``; links numbers of
+    messages ``sent``, ``delivered``, ``lost`` and ``late``, their ``mean_age`` (s), and maybe
+    ``delivery_probability``. Undirected ones have those of the other direction as ``sent_back`` and
+    so on, unless a table tells directions apart. Links that follow positions are there if they
+    carried.
     """
     import networkx
 

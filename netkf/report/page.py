@@ -102,11 +102,8 @@ def write_report(
     trust: bool = False,
 ) -> Path:
     """Write the page of one or two directories, by default to ``report.html`` in the first; return
-    its path. The second may be a verdict on the first. ``replica`` and ``trust`` as in
-    ``read_source``.
-
-    Raises ScenarioError for other directories, or if ``out`` is a file other than a page, and
-    WriteError.
+    its path. ``replica`` and ``trust`` as in ``read_source``. Raises ScenarioError for other
+    directories, or if ``out`` is a file other than a page, and WriteError.
     """
     path = Path(directories[0]) / "report.html" if out is None else out
     if out is not None or path.parent.is_dir():

@@ -420,14 +420,12 @@ class DerivedScenario(ScenarioModel):
     def continuous_truth(
         self, streams: Streams, frames: bool | None = None, sampled: FloatArray | None = None
     ) -> Any:
-        """Return the true state of one run in continuous time, a plants.truth.ContinuousTruth.
+        """Return the true state of a run, a plants.truth.ContinuousTruth, to be asked in increasing
+        order for sample, probe and frame times.
 
-        It can be asked, in increasing order, for the states at sample times, probe times and frame
-        times. Its class is ``DiffusionPath`` if sensors give increments, else ``SampledTruth``,
-        ``RecordedTruth`` or ``CurvePath``. ``frames``, by default ``exact_errors``, says whether
-        local states are relative to an origin that moves. ``sampled`` (K,) are the sample times in
-        seconds, if they have been drawn already. Raises ScenarioError if a recorded truth has no
-        row for one of the times.
+        ``frames``, by default ``exact_errors``: local states are relative to an origin that moves.
+        ``sampled`` (K,) are sample times in seconds if drawn. Raises ScenarioError if a recorded
+        truth lacks a row.
         """
         frames = self.exact_errors if frames is None else frames
         if isinstance(self.plant, NonlinearDiffusion):
@@ -633,12 +631,9 @@ class DerivedScenario(ScenarioModel):
         )
 
     def move_back(self, offset: FloatArray, age: float) -> FloatArray:
-        """Return exp(-A age) ``offset`` (n,): the offset of states ``age`` seconds earlier, without
-        the modes that have decayed to 1e-8 of it since.
-
-        When the origin of states moves (``exact_errors``), engines shift the estimates in messages
-        under way by it, which refer to the time of sending. In slots this is ``offset`` itself:
-        messages from slots before the present one are not used.
+        """Return exp(-A age) ``offset`` (n,), that of states ``age`` seconds earlier, without modes
+        that have decayed to 1e-8 of it; in slots ``offset``. By it engines shift estimates in
+        messages under way, which refer to the time of sending, when the origin moves.
         """
         if self.slotted:
             return offset

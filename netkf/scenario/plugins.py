@@ -84,12 +84,9 @@ def find_module_files(scenario: Component) -> dict[str, Path | None]:
 
 
 def explain_user_error(scenario: Any, error: Exception) -> str | None:
-    """Return the message ``module:Class failed in method: error; file, line n`` for an error in a
-    user's class, which tells the user that the mistake is in their code.
-
-    ``scenario`` is a scenario or a tuple of components. The method is the deepest one of a user's
-    class in the traceback, at the deepest line in its file; without one it is the method that
-    returned last, and its result is told. Returns None if all classes are netkf's own.
+    """Return ``module:Class failed in method: error; file, line n`` for an error in a user's class:
+    the deepest method of one in the traceback, or else the one that returned last, with its result.
+    None if all classes are netkf's own.
     """
     components = user_components(scenario)
     if not components:

@@ -212,13 +212,11 @@ def list_kinds(family: str) -> list[str]:
 def find_kind(
     family: str, kind: object, origin: Origin, table: Mapping[str, Any] = MappingProxyType({})
 ) -> type[Component] | None:
-    """Return the class that ``kind`` names: a kind of the family, ``"package.module:Class"``, or a
-    kind that an installed package offers.
+    """Return the class that ``kind`` names: of the family, ``"package.module:Class"``, or offered
+    by a package; other keys of ``table`` choose among several.
 
-    ``table`` has the other keys beside ``kind``; where several classes share the kind, one of these
-    chooses the class. Returns None for a user's class that is not loaded yet and must not be
-    imported (:class:`Origin`). Raises ScenarioError if the class does not exist or may not be
-    imported.
+    Returns None for a user's class that is not loaded and must not be (:class:`Origin`). Raises
+    ScenarioError if it does not exist or may not be imported.
     """
     choices = list_names_of_kind(family, kind)
     if choices:

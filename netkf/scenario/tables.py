@@ -54,10 +54,8 @@ S = TypeVar("S", bound=DerivedScenario)
 
 
 def change_keys(scenario: S, changes: Mapping[str, Any]) -> S:
-    """Return a scenario with the values at some key paths changed, see ``Scenario.replace``.
-
-    Files and modules are looked up in the folder of the scenario's file. A scenario that was built
-    in Python has none: then it is that of its first data file, or the current folder.
+    """Return a scenario with values at key paths changed; files and modules are looked up in the
+    folder of its file, or else of its first data file, or the current one.
     """
     folder = getattr(scenario, "_folder", None)
     if folder is None:
