@@ -45,7 +45,6 @@ def verdict_text(verdict: Verdict, claim: str = "", command: str = "", full: boo
 
 
 def _computed_lines(rows: list[Evidence]) -> list[str]:
-    """Return one line on ``rows`` that are computed without any run, if there are any."""
     if not rows:
         return []
     listed = "; ".join(f"{row.promise} [{row.source}]: {row.verdict}" for row in rows)

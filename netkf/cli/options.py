@@ -52,10 +52,8 @@ def parse_changes(settings: Sequence[str]) -> dict[str, Any]:
 def load_scenario(
     options: argparse.Namespace, ignored: Mapping[str, Any] = MappingProxyType({})
 ) -> Scenario:
-    """Return the scenario of the command line with ``--set`` and ``--seed`` applied.
-
-    ``ignored`` has values, by key, for keys that the command does not use: they replace those of
-    the file, which may be invalid together with other options. Raises ScenarioError.
+    """Return the scenario of the command line with ``--set`` and ``--seed``; ``ignored`` values
+    replace those of keys that the command does not use. Raises ScenarioError.
     """
     copy: Path | None = getattr(options, "copy", None)
     path = options.scenario if copy is None else copy

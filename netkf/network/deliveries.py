@@ -45,9 +45,7 @@ class Deliveries:
             self._numbers.setdefault((sender, receiver), []).append(message)
 
     def given(self, loss: Loss, sent: Transmission) -> FloatArray:
-        """Return the delivery probabilities (K,) in the run, by its ``loss``, of the messages
-        ``sent``: those that a link carries, and when, are the same in each replay.
-        """
+        """Return the delivery probabilities (K,) of ``sent``, the same in each replay."""
         key = sent.link, int(sent.number[0]) if len(sent.number) else 0, len(sent.number)
         if key not in self._given:
             self._given[key] = delivery_probabilities(loss, sent)

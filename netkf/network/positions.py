@@ -105,9 +105,7 @@ class Positions:
         return node in self._entries or node in self._rows or node in self._fixed
 
     def at(self, node: int, time: float, x: FloatArray | None) -> tuple[float, ...]:
-        """Return the point of ``node`` (id) at ``time`` in seconds, where the true state is ``x``
-        (n,), which only ``of_state`` is asked for.
-        """
+        """Return the point of ``node`` (id) at ``time`` (s), by its state ``x`` if ``of_state``."""
         if node in self._entries:
             assert x is not None
             return tuple(x[self._entries[node]].tolist())

@@ -46,11 +46,8 @@ class MessageTable:
         return {link: 1 + max(listed) for link, listed in self.values.items()}
 
     def value(self, link: Link, message: int, after: str) -> float | None:
-        """Return the value of message number ``message`` on ``link`` (sender, receiver); None if
-        the table does not list it.
-
-        With ``after`` "repeat" the table of the link starts again after its largest number. With
-        "refuse" raises ScenarioError at "path" for a message that is not listed.
+        """Return the value of a message on ``link``, None if it is not listed: with ``after``
+        "repeat" the table starts again, with "refuse" ScenarioError is raised at "path".
         """
         listed = self.values.get(link, {})
         if after == "repeat" and listed:

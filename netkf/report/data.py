@@ -52,10 +52,9 @@ def run_data(
     budget: Budget,
     packer: Packer,
 ) -> dict[str, Any]:
-    """Return the data of a run for the live views as JSON values; columns are added to ``packer``.
-
-    ``readings`` are innovations or the reason for none, ``layout`` the positions of nodes;
-    ``budget`` limits the numbers of messages and sample values.
+    """Return the data of a run for the live views as JSON values, with columns in ``packer``:
+    innovations ``readings`` or the reason for none, ``layout`` positions; ``budget`` limits
+    numbers.
     """
     worst = None if source.worst is None else source.worst.explained
     horizon = float(source.scenario.horizon)

@@ -153,10 +153,9 @@ class ReportSource:
 def read_source(
     directory: Path, replica: int | str | None = None, trust: bool = False
 ) -> ReportSource:
-    """Return the contents of a directory that netkf wrote; raises ScenarioError for another.
-
-    ``replica`` chooses a recorded run of an ensemble, by number or as ``"worst"`` or ``"median"``
-    by RMS error; of interrupted runs what was written is read. ``trust`` imports classes.
+    """Return the contents of a directory of netkf. ``replica`` chooses a run of an ensemble, by
+    number, or ``"worst"`` or ``"median"`` by RMS error; ``trust`` imports classes. Raises
+    ScenarioError.
     """
     stored = open_directory(directory, trust=trust)
     label, text = str(directory), (directory / "scenario.toml").read_text(encoding="utf-8")

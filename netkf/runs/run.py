@@ -291,9 +291,7 @@ class Manifest:
 
     @classmethod
     def of(cls, scenario: Scenario, directory: Path, engine: str, **others: Any) -> Manifest:
-        """Return the manifest of runs of a scenario, of its own seed from replica 0 on unless
-        ``others``, further fields, say so.
-        """
+        """Return the manifest of runs from replica 0 on, unless ``others`` say so."""
         given = {"seed": scenario.seed, "replica": 0, **others}
         names, grid = scenario.topology.names, scenario.time_grid
         return cls(

@@ -385,7 +385,6 @@ class ScenarioModel(Component):
         return [label for sensor in placed for label in self._value_labels(sensor, states)]
 
     def _value_labels(self, sensor: Sensor, states: Sequence[str]) -> Iterator[str]:
-        """Yield the labels of the values of a reading from those of the n ``states``."""
         if isinstance(sensor, PositionedSensor):
             of = ", ".join(filter(None, (states[k] for k in sensor.states)))
             yield from [f"range in {of}" if of else "range"] * (sensor.rows - sensor.turns)

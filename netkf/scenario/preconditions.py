@@ -140,7 +140,6 @@ def _translates(scenario: DerivedScenario) -> bool:
 
 
 def _check_own_blocks(scenario: DerivedScenario) -> None:
-    """Check that nodes have no block in common, and that their first errors are independent."""
     name, estimates = filter_name(scenario), scenario.filter.estimates
     if len(scenario.nodes) > 1:
         blocks = list(itertools.chain.from_iterable(scenario.estimated)) if scenario.plants else []

@@ -38,18 +38,13 @@ NO_DELAY = "took no time unless lost"
 
 
 def record_usage(scenario: DerivedScenario, sent: Mapping[Link, int] | None) -> dict[str, Use]:
-    """Return the use of each table by a run to the horizon, by key path of its component.
+    """Return the use of each table by a run to the horizon, by the first key that names it.
 
     ``sent`` counts the messages of each directed link, lost ones included; None leaves out the
-    tables of losses and delays, whose use differs from run to run. Each entry has ``path``, the
-    name of the file, ``rows``, the number of its rows, and ``unused``, how many of them the run did
-    not use; where rows repeat others, also ``used`` and ``merged``, the number of rows that repeat
-    a used one (``rows`` is the sum of the three). Those of losses and delays also have ``beyond``,
-    the number of messages that the table does not list, and ``after``, what the scenario says about
-    these. Tables of graphs and positions have entries only if rows repeat others or are unused.
-
-    Several sensors may name one table: its entry has the key of the first one, and a row is used
-    if any of them uses it.
+    tables of losses and delays. Each entry has ``path``, ``rows`` and ``unused``; where rows repeat
+    others also ``used`` and ``merged`` (``rows`` is the sum of the three). Those of losses and
+    delays have ``beyond``, messages that are not listed, and ``after``, what becomes of these.
+    Tables of graphs and positions have entries only if rows repeat others or are unused.
     """
     uses = {
         f"network.graph{key}": _make_use(use)

@@ -152,10 +152,8 @@ class RunDirectory:
 
     @cached_property
     def samples(self) -> pd.DataFrame | None:
-        """Samples after time 0 of all runs by run, time and node; None if not all were kept.
-
-        Columns are run, t (s), node, sq_error, nees, mean_trace (trace of P), the diagonal of P,
-        and the true states x0, x1, ... Raises ScenarioError if states.parquet is damaged.
+        """Samples after time 0 by run, t (s) and node; None if not all were kept: sq_error, nees,
+        mean_trace (trace of P), the diagonal of P, and x0, x1, ... Raises ScenarioError.
         """
         file = self.directory / "states.parquet"
         if not file.exists() or self.runs < 2:

@@ -103,10 +103,8 @@ def format_answer(sizing: Sizing) -> str:
 
 
 def format_consistency(consistency: Consistency, full: bool = True) -> str:
-    """Return a row per node, or block of a node, and a legend of the columns.
-
-    Unless ``full``, a large network has rows for the nodes whose P is inconsistent, and for the
-    first and last of the others.
+    """Return a row per node or block and a legend; unless ``full``, a large network has those whose
+    P is inconsistent, and the first and last of the others.
     """
     of_blocks = bool(consistency.rows[0].block)
     header = ["node", *["block"] * of_blocks]

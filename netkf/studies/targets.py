@@ -173,11 +173,9 @@ def quantity_by_simulation(
     central: float | None,
     names: Sequence[str] = (),
 ) -> QuantityInterval:
-    """Return the quantity over the runs of ``metrics``, with Student's interval (of the worst node
-    for all nodes, Bonferroni) that misses its true value with probability ``level``.
-
-    ``central`` is the trace of P of the centralised filter to divide by, or None; ``names`` are
-    those of ``metrics.quantities``.
+    """Return the quantity over runs with Student's interval, of the worst node for all nodes
+    (Bonferroni), which misses it with probability ``level``; ``central`` is a trace of P to divide
+    by, ``names`` those of ``metrics.quantities``.
     """
     if target.of_runs:
         values = metrics.quantities[:, [names.index(target.quantity)]]

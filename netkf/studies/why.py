@@ -109,7 +109,6 @@ def why(
 def _check_run(
     run: Run | str | Path, scenario: Scenario | None, replica: int | None, trust: bool
 ) -> tuple[Run, Scenario]:
-    """Return the run with its events and its scenario; raises ScenarioError."""
     name = "run" if isinstance(run, Run) else shorten(run)
     if not isinstance(run, Run):
         stored = open_directory(run, trust=trust)

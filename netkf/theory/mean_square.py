@@ -178,7 +178,6 @@ def _system_maker(scenario: Scenario) -> Callable[[Scenario], LinearErrors] | No
 
 
 def _require_size(shape: tuple[int, int, int]) -> None:
-    """Raise TheoryError for S joint states of links and M errors that are too many."""
     S, M, _ = shape
     if M > MAX_ERRORS:
         raise TheoryError(

@@ -82,7 +82,6 @@ def gaussian_noises(samples: PartSamples) -> Assumption:
 
 
 def _is_gaussian(samples: PartSamples, group: str) -> bool:
-    """Return False if noises of a user's class are found not to be Gaussian, at LAW_LEVEL."""
     if group == START and not is_own_class(samples.scenario.plant, "plant"):
         return True
     draws, labels, noun, gaussian = _draws(samples, group)

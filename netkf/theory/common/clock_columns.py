@@ -185,7 +185,6 @@ class ClockColumns(LoggedColumns):
         forms.table[self._x, : forms.used] = 0.0
 
     def _move_increments(self, time: float) -> None:
-        """Move nodes that read increments, and the true state, to ``time``."""
         flows, filters, forms = self._flows, self._filters, self._forms_of_all
         if flows is None or time <= self._now:
             return

@@ -152,7 +152,6 @@ def _sensor_rows(sources: list[_Source], past: list[FloatArray], window: int) ->
 
 
 def _make_row(node: int, sources: list[_Source], past: list[FloatArray], window: int) -> LevelRow:
-    """Return the row of ``sources``: the whole network (``node`` -1), or one sensor."""
     values = _levels(sources, past, window)
     mean = float(values.mean())
     error = QUANTILE * float(values.std(ddof=1)) / np.sqrt(len(values))

@@ -121,7 +121,6 @@ def detecting_walk(scenario: Scenario) -> list[int] | None:
 
 
 def _extend_basis(basis: FloatArray, rows: FloatArray) -> FloatArray:
-    """Return an orthonormal basis (r, n) of the span of ``basis`` (k, n) and ``rows`` (p, n)."""
     size = np.abs(rows).max(initial=0.0)
     if size == 0.0:
         return basis

@@ -131,7 +131,6 @@ def _link_probabilities(
 
 
 def _nodes_and_links(graph: Any) -> tuple[list[Any], list[Edge]]:
-    """Return the nodes and links of a graph; raises TheoryError if it is directed or empty."""
     if isinstance(graph, Topology):
         names, links, directed = list(graph.nodes), list(graph.links), graph.directed
     else:

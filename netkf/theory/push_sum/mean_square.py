@@ -125,7 +125,6 @@ def _groups(closed: FloatArray) -> list[FloatArray]:
 
 
 def _radius(law: Averaging, closed: FloatArray) -> float:
-    """Return the mean-square radius for one group of n states; raises TheoryError."""
     if law.deterministic:  # M is fixed, so that T is the square of the mean dynamics
         return _mean_radius(law, closed) ** 2
     size = closed.shape[0] * closed.shape[1]
