@@ -168,16 +168,22 @@ def format_filters(comparison: FilterComparison) -> str:
         ]
         for row in ran
     ]
-    lines = [format_table(header, rows, left_columns=1), ""]
+    legend = _filter_legend(comparison, ran, "mean_age" in more)
+    return "\n".join([format_table(header, rows, left_columns=1), "", *legend])
+
+
+def _filter_legend(
+    comparison: FilterComparison, ran: list[ComparedFilter], has_ages: bool
+) -> list[str]:
     noted = [row for row in comparison.rows if row.status != "complete"]
-    lines += [f"{shorten(row.filter)}: {row.status}" for row in noted]
+    lines = [f"{shorten(row.filter)}: {row.status}" for row in noted]
     runs = f"{comparison.runs:,} run{'s' if comparison.runs > 1 else ''} of each on the same draws"
     lines.append(f"{runs}; +-: one standard error; differences from {shorten(ran[0].filter)}, run")
     lines.append(
         f"by run; * for certain, all marks together at confidence {comparison.confidence:g}"
     )
     lines.append("worst instant: largest error of any node at any sample; traffic of replica 0")
-    if "mean_age" in more:
+    if has_ages:
         lines.append("age: of the newest reading of each sensor, mean over time and nodes, s")
     predicting = [shorten(row.filter) for row in ran if row.predicts]
     if predicting and len(predicting) < len(ran):
@@ -190,7 +196,7 @@ def format_filters(comparison: FilterComparison) -> str:
             f"note: {', '.join(others)}: other exchanges than those of {shorten(ran[0].filter)}, "
             "and so other losses and delays of the same law"
         )
-    return "\n".join(lines)
+    return lines
 
 
 def _is_known(row: ComparedFilter, name: str) -> bool:
@@ -230,11 +236,8 @@ def format_comparison(comparison: Comparison) -> str:
         rows = [*rows[: MAX_ROWS - 3], _rest_row(len(rows) - MAX_ROWS, numbered), *rows[-3:]]
     lines += ["", format_table(["", *numbered], rows, left_columns=1)]
     notes = [f"note: {remark}" for remark in comparison.remarks()]
-    notes += [
-        f"note: {mark} {shorten(note, 500)}"
-        for mark, texts in zip(numbered, comparison.notes, strict=True)
-        for note in texts
-    ]
+    for mark, texts in zip(numbered, comparison.notes, strict=True):
+        notes += [f"note: {mark} {shorten(note, 500)}" for note in texts]
     lines += ["", *notes] if notes else []
     methods = {e.method for row in comparison.rows for e in row.entries if e.method}
     intervals = ", ".join(sorted(methods - {"one run"}))

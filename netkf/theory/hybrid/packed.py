@@ -166,7 +166,7 @@ class PackedRiccati:
         change += group.heard @ arriving
 
     def linear(self, P: FloatArray) -> LinearisedRiccati:
-        """Return H(12) linearised at ``P`` (N, n, n): changes of gains have no first-order effect."""
+        """Return H(12) linearised at ``P`` (N, n, n): gains have no first-order effect."""
         drifts = self._drifts()
         drifts[self._sensed] -= P[self._sensed] @ self.equations.G[self._sensed]
         own, heard = [], [(self.equations.coupling, np.arange(len(P)), self._predicted[None])]
