@@ -246,7 +246,6 @@ def _create_output(
 def _keep_partial_results(
     output: _Output, recorder: Recorder, is_complete: bool, error: BaseException
 ) -> None:
-    """Finish the files of a run that stopped with ``error``."""
     status = "failed" if isinstance(error, Exception) else "interrupted"
     for finish in (recorder.flush, output.close_tables):
         with contextlib.suppress(Exception):  # a full disk fails again, and ``error`` says so

@@ -93,7 +93,6 @@ class SlotColumns(ErrorColumns):
         return filters
 
     def _restart(self, slot: int) -> None:
-        """Let the nodes begin again that do so when a slot begins."""
         setup, records, scenario = self._setup, self._filters.records, self._scenario
         before = max(slot - (not scenario.node_filter.timing.predicts), 0)
         for h in self._restarts.get(slot, ()):

@@ -124,7 +124,6 @@ def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _information_row(scenario: Scenario) -> AssumptionRow:
-    """Return the row on the cooperative information condition D (19): its least level."""
     name = "the sensors together excite every direction (sufficient)"
     if not few_regressors(scenario):
         evidence = f"not computed beyond {MAX_REGRESSORS} sensors whose H varies"

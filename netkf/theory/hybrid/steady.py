@@ -173,7 +173,6 @@ def _implicit_step(implicit: PackedRiccati, P: FloatArray) -> FloatArray | None:
 
 
 def _no_steady_state(scenario: Scenario, equations: CoupledRiccati) -> str:
-    """Return why H(12) has no steady state, and what would give one."""
     if not equations.talks:
         unsteady = np.isnan(steady_by_node(scenario)[:, 0, 0])
         unsteady_nodes = [

@@ -46,7 +46,6 @@ def _reachable_readings(scenario: Scenario) -> dict[int, FloatArray]:
 
 
 def _detectability_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the row that (F, H) is detectable at every node from all that reaches it."""
     F = scenario.linear_plant.F
     name = "(F, H) is detectable at every node"
     try:
@@ -88,7 +87,6 @@ def _arrival_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _bounded_mean_row(scenario: Scenario) -> AssumptionRow:
-    """Return the row on R (32): some gains make errors contract in the mean square."""
     F, sensing = scenario.linear_plant.F, set(scenario.sensing_nodes)
     least_sufficient: tuple[float, int, list[float]] | None = None
     for node, H in _reachable_readings(scenario).items():
