@@ -60,6 +60,7 @@ class GridLaws:
         self._fill_impulses(noise, 0, period, _NODES * period, _WEIGHTS * period)
         self.noise_factor = noise_factors(noise[None])[0][0]
         self._conditional_laws: dict[tuple[float, float], tuple[FloatArray, FloatArray]] = {}
+        self._cut_laws: dict[tuple[float, float], tuple[FloatArray, FloatArray, FloatArray]] = {}
         self._grids: dict[tuple[int, int], FloatArray] = {}
 
     def grid(self, first: int, count: int) -> FloatArray:
@@ -93,6 +94,19 @@ class GridLaws:
             if len(self._conditional_laws) >= MAX_LAWS:
                 self._conditional_laws.clear()
             law = self._conditional_laws[key] = self._conditional(*key)
+        return law
+
+    def cut_law(self, length: float, before: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the ``conditional_law`` of a cut, and ``responses`` (3, 3, n, n) over the whole
+        piece and the parts before and after it.
+        """
+        # The responses are those of the very gaps, not of their instants.
+        law = self._cut_laws.get((length, before))
+        if law is None:
+            responses = [self.responses(gap) for gap in (length, before, length - before)]
+            law = *self.conditional_law(length, before), np.stack(responses)
+            if len(self._cut_laws) < MAX_LAWS:
+                self._cut_laws[length, before] = law
         return law
 
     def _conditional(self, length: float, before: float) -> tuple[FloatArray, FloatArray]:

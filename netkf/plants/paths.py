@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES, MANY, ONE, Lanes, load, spread, store
 from netkf.linalg.portable import apply
@@ -217,35 +217,48 @@ class DiffusionPaths:
             ends=block.ends,
         )
         # A piece with several cuts is cut at the first time, then its remainder at the second, ...
-        stops = np.cumsum(counts)[owners].tolist()
+        stops, laws = np.cumsum(counts)[owners].tolist(), []
+        rows, lengths = np.empty((len(times), 2), dtype=np.int64), np.empty((len(times), 2))
         for cut, (owner, stop) in enumerate(zip(owners.tolist(), stops, strict=True)):
             row, time = owner + cut, float(times[cut])
-            self._split(pieces, row, stop, time, np.ascontiguousarray(normals[:, cut]))
+            start = float(pieces.start[row])
+            rows[cut], lengths[cut] = (row, stop), (float(pieces.end[row]) - start, time - start)
+            laws.append(self.laws.cut_law(*lengths[cut].tolist()))
+            pieces.end[row] = pieces.start[row + 1 : stop] = time
+        gains, factors, responses = (np.array(part) for part in zip(*laws, strict=True))
+        work, parts = np.empty((4, 3 * self.laws.n)), (pieces.x_start, pieces.x_end)
+        parts += pieces.moments, pieces.cubic
+        split_pieces(rows, normals, gains, factors, responses, lengths, work, parts)
         return pieces
 
-    def _split(
-        self, pieces: StepBlock, row: int, stop: int, time: float, normals: FloatArray
-    ) -> None:
-        """Cut the piece in ``row`` of B paths at ``time``."""
-        laws, start = self.laws, float(pieces.start[row])
-        length, before = float(pieces.end[row]) - start, time - start
-        split_piece(
-            row,
-            stop,
-            normals,
-            *laws.conditional_law(length, before),
-            np.stack([laws.responses(gap) for gap in (length, before, length - before)]),
-            np.array([length, before]),
-            np.empty((4, 3 * laws.n)),
-            (pieces.x_start, pieces.x_end, pieces.moments, pieces.cubic),
-        )
-        pieces.end[row] = pieces.start[row + 1 : stop] = time
+
+@kernel
+def split_pieces(
+    rows: IntArray,
+    normals: FloatArray,
+    gains: FloatArray,
+    factors: FloatArray,
+    responses: FloatArray,
+    lengths: FloatArray,
+    work: FloatArray,
+    pieces: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+) -> None:
+    """Make C cuts of the pieces of B paths one after the other, as ``split_piece`` makes one.
+
+    rows    (C, 2) the row that is cut, and the row before which its remainder ends
+    normals (B, C, 3 n) standard normal numbers; the other arguments are those of each cut
+    """
+    for cut in range(len(rows)):
+        row, stop, gain, response = rows[cut, 0], rows[cut, 1], gains[cut], responses[cut]
+        of_cut = lengths[cut]
+        split_piece(row, stop, cut, normals, gain, factors[cut], response, of_cut, work, pieces)
 
 
 @kernel
 def split_piece(
     row: int,
     stop: int,
+    number: int,
     normals: FloatArray,
     gain: FloatArray,
     factor: FloatArray,
@@ -257,7 +270,7 @@ def split_piece(
     """Cut the piece in ``row`` of B paths in place, given its end and moments. The row becomes the
     part before the cut, and the rows after it up to ``stop`` the part after it.
 
-    normals   (B, 3 n) standard normal numbers
+    normals   (B, C, 3 n) standard normal numbers, of which this cut takes those with its ``number``
     gain      (3 n, 3 n) and ``factor`` (3 n, 3 n): GridLaws.conditional_law
     responses (3, 3, n, n) GridLaws.responses over the whole piece and the parts before and after
     lengths   (2,) seconds of the whole piece and of the part before the cut
@@ -283,7 +296,7 @@ def split_piece(
             mean = deviation = 0.0
             for c in range(3 * n):
                 mean += noise[c] * gain[e, c]
-                deviation += normals[run, c] * factor[e, c]
+                deviation += normals[run, number, c] * factor[e, c]
             cut_noise[e] = mean + deviation
         # cut = cut_noise + response to the start: state at the cut and moments before it
         add_response(cut, cut_noise, 1.0, responses, 1, x_start, run, row)

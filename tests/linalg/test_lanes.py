@@ -140,7 +140,7 @@ def move_rows(array, places, entries, lanes, rows, out, turned):
         turn(MANY, rows, first, turned)
 
 
-@pytest.mark.parametrize("shape", [(1,), (3,), (2, 2), (3, 3), (4, 4), (5, 5)])
+@pytest.mark.parametrize("shape", [(1,), (3,), (2, 2), (7,), (3, 3), (4, 4), (5, 5)])
 def test_rows_go_into_lanes_and_back(shape):
     random, entries = np.random.default_rng(3), math.prod(shape)
     array, out, lanes = with_spare((20, *shape)), with_spare((20, *shape)), with_spare((entries, 8))
