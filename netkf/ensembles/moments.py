@@ -57,7 +57,7 @@ def merge_moments(a: Moments, b: Moments) -> Moments:
     """Return the moments of the observations of ``a`` and ``b`` together; both have S rows and C
     columns.
     """
-    size, mean, M2 = (np.stack(pair) for pair in zip(a, b, strict=True))
+    size, mean, M2 = (np.array(pair) for pair in zip(a, b, strict=True))
     join_nodes(size, _in_columns(mean), _in_columns(M2), 2, 1)
     return Moments(size[0], mean[0], M2[0])
 

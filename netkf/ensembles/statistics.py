@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -234,7 +235,7 @@ def _quantities(
         squares, ends = traces_of(batch.P), spans[:, 2]
     # Runs with the same samples, mostly all, together.
     found = np.empty((len(batch), len(scenario.nodes) + 1, len(sample_names(scenario))))
-    for first, end in np.unique(np.column_stack([spans[:, 0], ends]), axis=0).tolist():
+    for first, end in sorted(set(zip(spans[:, 0].tolist(), ends.tolist(), strict=True))):
         runs = (spans[:, 0] == first) & (ends == end)
         part = squares[:, first:end] if runs.all() else squares[runs, first:end]
         values = sample_quantities(scenario, part)
@@ -251,9 +252,16 @@ def merge_runs(values: RunValues, piece: int) -> RunStatistics:
     The fingerprint and the traces are empty; ``block_statistics`` adds them.
     """
     runs = values.pieces[piece]
-    samples, count = values.samples[piece], len(values.messages[runs])
-    # One value per run: every run has size 1.
-    sizes = np.ones((count, 1))
+    samples, parts = values.samples[piece], (values.averages, values.quantities, values.messages)
+    columns = [part[runs].reshape(len(part[runs]), -1) for part in parts]
+    # One value per run: every run has size 1. All columns in one call.
+    sizes = np.ones((len(columns[0]), 1))
+    whole = moments_of(np.concatenate(columns, axis=1)[:, None], sizes.copy())
+    ends = np.cumsum([0, *(part.shape[1] for part in columns)]).tolist()
+    averages, quantities, messages = (
+        Moments(whole.size, whole.mean[:, first:end], whole.M2[:, first:end])
+        for first, end in itertools.pairwise(ends)
+    )
     # Moments of each conserved sum at the start and end, and its largest relative drift.
     conserved = {
         name: (
@@ -266,13 +274,11 @@ def merge_runs(values: RunValues, piece: int) -> RunStatistics:
         # All nodes have the estimate of one pooled filter.
         mean, M2 = (np.tile(moment, values.copies) for moment in (samples.mean, samples.M2))
         samples = Moments(samples.size, mean, M2)
-    averages, messages = values.averages[runs].reshape(count, 1, -1), values.messages[runs, None]
-    quantities = values.quantities[runs].reshape(count, 1, -1)
     return RunStatistics(
         samples=samples,
-        averages=moments_of(averages.copy(), sizes.copy()),
-        quantities=moments_of(quantities.copy(), sizes.copy()),
-        messages=moments_of(messages.copy(), sizes.copy()),
+        averages=averages,
+        quantities=quantities,
+        messages=messages,
         totals=np.array([values.events[runs].sum(), values.diverged[runs].sum()]),
         conserved=conserved,
         rounding_from=float(values.rounding_from[runs].min()),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -117,11 +118,17 @@ def as_kernel_array(matrix: FloatArray) -> FloatArray:
     return np.array(matrix, order="C")
 
 
+@cache
+def upper_indices(n: int) -> tuple[IntArray, IntArray]:
+    """Return the rows and columns (n (n + 1) / 2,) of an upper triangle, row by row."""
+    return np.triu_indices(n)
+
+
 def from_upper(values: FloatArray, n: int) -> FloatArray:
     """Return symmetric matrices (..., n, n) from their upper triangles ``values`` (..., u), row by
     row.
     """
-    i, j = np.triu_indices(n)
+    i, j = upper_indices(n)
     matrices = np.empty((*values.shape[:-1], n, n))
     matrices[..., i, j] = matrices[..., j, i] = values
     return matrices

@@ -226,8 +226,7 @@ class DiffusionPaths:
             laws.append(self.laws.cut_law(*lengths[cut].tolist()))
             pieces.end[row] = pieces.start[row + 1 : stop] = time
         gains, factors, responses = (np.array(part) for part in zip(*laws, strict=True))
-        work, parts = np.empty((4, 3 * self.laws.n)), (pieces.x_start, pieces.x_end)
-        parts += pieces.moments, pieces.cubic
+        work, parts = np.empty((4, normals.shape[2])), pieces[2:6]
         split_pieces(rows, normals, gains, factors, responses, lengths, work, parts)
         return pieces
 

@@ -232,7 +232,7 @@ def quick_runs(scenario: Scenario) -> int:
     if uses_grid(scenario):
         visits += steps_to_the_end(scenario) * len(scenario.increment_sensors)
     # Those of the other loop are not computed side by side.
-    max_runs = int(QUICK_VISITS / (visits if is_immediate(scenario) else ALONE * visits))
+    max_runs = int(QUICK_VISITS / (visits if is_immediate(scenario) else 2 * visits))
     return 1 << max(0, min(max_runs, batch_size(scenario)).bit_length() - 1)
 
 

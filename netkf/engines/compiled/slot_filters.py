@@ -17,7 +17,6 @@ from netkf.algorithms.kernels.run import (
     Estimates,
     SlotRun,
     SlotTables,
-    opposite_links,
     scratch_of,
     size_of,
 )
@@ -118,7 +117,7 @@ class SlotFilters:
             model=self._models[0],
             first=setup.links.first,
             sender=setup.links.sender,
-            opposite=opposite_links(setup.links.first, setup.links.sender),
+            opposite=setup.opposite,
             weight=setup.links.weight,
             y=np.zeros((1, 1, LANES)),
             H=np.zeros((1, 1, 1, LANES)),

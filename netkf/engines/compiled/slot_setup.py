@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import Filter, NodeInfo, may_be_silent
+from netkf.algorithms.kernels.run import opposite_links
 from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.models import SlotModel, first_roots
 from netkf.engines.compiled.nonlinear_rows import NonlinearSetup
@@ -86,6 +87,7 @@ class SlotSetup:
         self.senders = link_senders(links, topology.directed, symmetric)
         self.directions: tuple[Link, ...] = self.senders.directions
         self.links = self._make_links(scenario)
+        self.opposite = opposite_links(self.links.first, self.links.sender)
         self.common = common_table(scenario)
         self._set_channel(scenario)
         self.matching = matching_lists(scenario)
