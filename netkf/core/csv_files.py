@@ -24,7 +24,7 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError, suggest_nearest
 from netkf.core.fields import MAX_MAGNITUDE, SourceFile
-from netkf.core.printable import MAX_NAME
+from netkf.core.printable import MAX_NAME, NamedNode
 from netkf.linalg.arrays import FloatArray
 
 MAX_BYTES = 256 << 20  # of a table, unpacked; it limits the memory that reading takes
@@ -101,6 +101,7 @@ class Columns(dict[str, FloatArray]):
             raise ScenarioError("path", rule, float(column[wrong[0]]), "correct it")
         # Ids of nodes that have names are printed as these.
         named = {int(node): node for node in (self.source.node_ids or {}).values()}
+        named |= {code: NamedNode(code, name) for name, code in self.source.unknown.items()}
         return [named.get(int(value), int(value)) for value in column]
 
 

@@ -169,8 +169,9 @@ def rebuild(part: Any, change: Callable[[Any, dataclasses.Field[Any], Any], Any]
     changed = {}
     for field in dataclasses.fields(part):
         value = getattr(part, field.name)
-        # The keys of the kind of a filter stand beside those that all filters have.
-        key = nullcontext() if field.name == "algorithm" else errors_under(field.name)
+        # The keys of the kind of a filter, or of a block's plant, stand beside the other ones.
+        beside = field.name in ("algorithm", "plant")
+        key = nullcontext() if beside else errors_under(field.name)
         with key:
             new = change(part, field, value) if field.init else value
         if new is not value:
@@ -388,7 +389,9 @@ def either(first: Rule, second: Rule, is_second: Callable[[Any], bool]) -> Rule:
 
     requirement = f"{first.requirement}, or {second.requirement.removeprefix('must be ')}"
     schemas = [dict(rule.schema) for rule in (first, second)]
-    return Rule(requirement, convert, first.remedy, {"anyOf": schemas} if all(schemas) else {})
+    schema = {"anyOf": schemas} if all(schemas) else {}
+    of_nodes = first.of_nodes or second.of_nodes
+    return Rule(requirement, convert, first.remedy, schema, of_nodes)
 
 
 def has_depth(depth: int) -> Callable[[Any], bool]:

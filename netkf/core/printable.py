@@ -8,6 +8,31 @@ MAX_NAME = 200
 """Longest name of a node, in characters."""
 
 
+class NamedNode(int):
+    """The id of a node that the graph's file names: an integer that is printed as the ``name``."""
+
+    name: str
+
+    def __new__(cls, node: int, name: str) -> NamedNode:
+        """Return the id ``node`` with its name."""
+        named = super().__new__(cls, node)
+        named.name = name
+        return named
+
+    def __str__(self) -> str:
+        return self.name
+
+    def __repr__(self) -> str:
+        return repr(self.name)
+
+    def __format__(self, spec: str) -> str:
+        """Return the name, or the id by a format of numbers."""
+        return format(int(self), spec) if spec else self.name
+
+    def __reduce__(self) -> tuple[type[NamedNode], tuple[int, str]]:
+        return NamedNode, (int(self), self.name)
+
+
 def printable(text: str, keep: str = "\n\t") -> str:
     """Return a text with control and format characters escaped as in ``repr``, except ``keep``.
 

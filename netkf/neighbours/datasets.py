@@ -10,9 +10,9 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError
 from netkf.core.extras import require
+from netkf.core.printable import NamedNode
 from netkf.core.version import __version__
 from netkf.ensembles.monte_carlo import Ensemble
-from netkf.network.graphs import NamedNode
 from netkf.runs.files import output_file, write_atomically
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.writing import resolve_defaults, to_toml

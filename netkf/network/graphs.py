@@ -32,6 +32,7 @@ from netkf.core.fields import (
     tuple_of,
     vector,
 )
+from netkf.core.printable import NamedNode
 from netkf.core.repeated_rows import RowUse, count_rows, first_rows
 from netkf.linalg.arrays import FloatArray
 from netkf.network.spectra import largest_laplacian_eigenvalue
@@ -44,31 +45,6 @@ MAX_TRIES = 1000  # random graphs that are tried until one is connected
 # Limits of what fits into memory with all states and messages.
 MAX_NODES, MAX_LINKS = 200_000, 1_000_000
 MAX_DRAWN = 400_000  # nodes and links of all graphs drawn in search of a connected one
-
-
-class NamedNode(int):
-    """The id of a node that the graph's file names: an integer that is printed as the ``name``."""
-
-    name: str
-
-    def __new__(cls, node: int, name: str) -> NamedNode:
-        """Return the id ``node`` with its name."""
-        named = super().__new__(cls, node)
-        named.name = name
-        return named
-
-    def __str__(self) -> str:
-        return self.name
-
-    def __repr__(self) -> str:
-        return repr(self.name)
-
-    def __format__(self, spec: str) -> str:
-        """Return the name, or the id by a format of numbers."""
-        return format(int(self), spec) if spec else self.name
-
-    def __reduce__(self) -> tuple[type[NamedNode], tuple[int, str]]:
-        return NamedNode, (int(self), self.name)
 
 
 def node_columns(node: int) -> dict[str, Any]:

@@ -26,6 +26,7 @@ from netkf.core.fields import (
     positive,
     source_file,
 )
+from netkf.core.repeated_rows import RowUse, count_rows, first_rows
 from netkf.network.graphs import Topology, demand_in_graph
 
 UP, DOWN = ("restart", "join"), ("crash", "leave")
@@ -133,31 +134,40 @@ class RecordedLife(Life):
         _ = self._table  # a mistake in the file is found on construction
 
     @cached_property
-    def _table(self) -> dict[int, list[Change]]:
+    def _table(self) -> tuple[dict[int, list[Change]], list[tuple[int, float]]]:
+        """The changes of each node in the order of time; the node and time of each row."""
         kinds = {"up": "restart", "down": "crash", "join": "join", "leave": "leave"}
         table = read_columns(self.path, ("t", "node", "what"), words={"what": tuple(kinds)})
         what = [list(kinds.values())[int(index)] for index in table["what"]]
-        rows: dict[int, list[tuple[float, int, str]]] = {}
-        for row, node in enumerate(table.integers("node")):
-            rows.setdefault(node, []).append((float(table["t"][row]), row, what[row]))
-        found = {}
-        for node, listed in rows.items():
-            changes = [Change(time, kind) for time, _, kind in sorted(listed)]
-            for (first, second), (_, row, _) in zip(
-                itertools.pairwise(changes), sorted(listed)[1:], strict=True
-            ):
-                if first.up == second.up or first.time == second.time:
-                    state = "up" if first.up else "down"
-                    rule = f"{table.where(row)}: node {node} is {state} already, or changes twice"
-                    raise ScenarioError("path", rule, second.time, "correct the rows of the node")
-            found[node] = changes
-        return found
+        keys = list(zip(table.integers("node"), table["t"].tolist(), strict=True))
+        rows = first_rows(table, keys, what, "a node must go up or down once at a time")
+        found: dict[int, list[Change]] = {}
+        for (node, time), row in sorted(rows.items()):
+            changes = found.setdefault(node, [])
+            changes.append(Change(time, what[row]))
+            if len(changes) > 1 and changes[-2].up == changes[-1].up:
+                before = rows[node, changes[-2].time]
+                state = "up" if changes[-1].up else "down"
+                rule = f"{table.where(before, row)}: node {node} is {state} already"
+                raise ScenarioError("path", rule, time, "correct the rows of the node")
+        return found, keys
+
+    def use(self, end: float) -> RowUse:
+        """Return the use of the rows by a run to ``end`` (s): those after 0, and the last one until
+        then, which says how a node begins.
+        """
+        found, keys = self._table
+        first = {
+            node: max((change.time for change in changes if change.time <= 0.0), default=0.0)
+            for node, changes in found.items()
+        }
+        return count_rows(self.path.name, keys, lambda key: first[key[0]] <= key[1] < end)
 
     def changes(
         self, node: int, random: Callable[[], np.random.Generator], horizon: float
     ) -> Sequence[Change]:
         """Return the rows of the node; those at time 0 or before say how it begins."""
-        listed = self._table.get(node, [])
+        listed = self._table[0].get(node, [])
         before = [change for change in listed if change.time <= 0.0]
         after = [change for change in listed if 0.0 < change.time < horizon]
         # A first change to what it is anyway, or a missing one, says how the node begins.
@@ -168,7 +178,7 @@ class RecordedLife(Life):
     def check(self, topology: Topology) -> None:
         """Raise ScenarioError unless all nodes of the table are in the entry."""
         super().check(topology)
-        missing = sorted(set(self._table) - set(self.nodes))
+        missing = sorted(set(self._table[0]) - set(self.nodes))
         if missing:
             rule = f"{self.path.name} has rows of nodes that are not in nodes"
             raise ScenarioError("path", rule, missing, "add them to nodes, or remove the rows")

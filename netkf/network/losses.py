@@ -30,6 +30,7 @@ from netkf.core.fields import (
     source_file,
 )
 from netkf.core.laws import Chain
+from netkf.core.repeated_rows import RowUse, count_rows, first_rows
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Link, Topology, demand_links
 
@@ -370,32 +371,38 @@ class GilbertElliott(Loss):
         return "sender" if self.shared else "link"
 
     @cached_property
-    def _table(self) -> tuple[dict[Link, GilbertElliott], dict[Link, int]]:
-        """The chain of each directed link with a row, and the number of its line."""
+    def _table(self) -> tuple[dict[Link, GilbertElliott], dict[Link, int], list[Link]]:
+        """The chain of each directed link with a row, its line, and the link of each row."""
         if self.path is None:
-            return {}, {}
+            return {}, {}, []
         table = read_columns(self.path, ("sender", "receiver"), _CHAIN)
         links = list(zip(table.integers("sender"), table.integers("receiver"), strict=True))
         columns = [name for name in _CHAIN if name in table]
         chains: dict[Link, GilbertElliott] = {}
-        for row, link in enumerate(links):
-            if link in chains:
-                rule = f"{table.where(row)}: a second row of this direction"
-                raise ScenarioError("path", rule, list(link), "leave one of the two out")
+        rows = list(zip(*(table[name].tolist() for name in columns), strict=True))
+        rows = rows or [()] * len(links)
+        rule = "a direction must have one chain"
+        first_row = first_rows(table, links, rows, rule)
+        for link, row in first_row.items():
             try:
                 values: dict[str, Any] = {name: float(table[name][row]) for name in columns}
                 chains[link] = GilbertElliott(**values, shared=self.shared)
             except ScenarioError as error:
                 rule = f"{table.where(row)}: {error.key} {error.rule}"
                 raise ScenarioError("path", rule, error.value, error.remedy) from None
-        lines = {link: int(line) for link, line in zip(links, table.lines, strict=True)}
+        lines = {link: int(table.lines[row]) for link, row in first_row.items()}
         for first, second in itertools.pairwise(sorted(chains) if self.shared else ()):
             steps = chains[first].transitions, chains[second].transitions
             if first[0] == second[0] and steps[0] != steps[1]:
                 rule = "must give all links of a sender the same transitions, if they are shared"
                 got = f"{list(first)} in line {lines[first]} and {list(second)} in line"
                 raise ScenarioError("path", rule, f"{got} {lines[second]}", "correct the rows")
-        return chains, lines
+        return chains, lines, links
+
+    def use(self, end: float) -> RowUse:
+        """Return the use of the rows of the table by a run to ``end`` (s)."""
+        assert self.path is not None
+        return count_rows(self.path.name, self._table[2], lambda _: end > 0.0)
 
     def of(self, link: Link) -> GilbertElliott:
         """Return the chain of a directed link."""
@@ -407,7 +414,7 @@ class GilbertElliott(Loss):
         """
         if self.path is None:
             return
-        chains, lines = self._table
+        chains, lines, _ = self._table
         demand_links(self.path, lines, topology)
         if all(getattr(self, name) is None for name in _CHAIN):
             for link in topology.directions:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from netkf.core.fields import (
     probability,
     source_file,
 )
+from netkf.core.repeated_rows import RowUse, count_rows, first_rows
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Link, Topology, demand_links
 from netkf.network.losses import Loss, Transmission
@@ -58,13 +60,21 @@ class ScheduledLoss(Loss):
         _ = self._steps  # a mistake in the file is found on construction
 
     @cached_property
-    def _steps(self) -> tuple[dict[Link, tuple[FloatArray, FloatArray]], dict[Link, int]]:
-        """Return times (K,) and probabilities (K,) by link, and first line numbers."""
+    def _steps(
+        self,
+    ) -> tuple[
+        dict[Link, tuple[FloatArray, FloatArray]], dict[Link, int], list[tuple[Link, float, float]]
+    ]:
+        """Times (K,) and probabilities (K,) by link, first line numbers, and link, beginning and
+        end of each row.
+        """
         table = _read_deliveries(self.path, ("from", "until", "sender", "receiver"))
         begins, ends, values = (table[name].tolist() for name in ("from", "until", "delivery"))
         links = list(zip(table.integers("sender"), table.integers("receiver"), strict=True))
+        keys = list(zip(links, begins, ends, strict=True))
         rows: dict[Link, list[int]] = {}
-        for row, link in enumerate(links):
+        rule = "a direction must have one delivery at a time"
+        for (link, _, _), row in first_rows(table, keys, values, rule).items():
             if not ends[row] > begins[row]:
                 rule = f"{table.where(row)}: until must be after from"
                 raise ScenarioError("path", rule, [begins[row], ends[row]], "correct the row")
@@ -81,7 +91,12 @@ class ScheduledLoss(Loss):
                 times += [begins[row], ends[row]]
                 probabilities += [values[row], self.otherwise]
             steps[link] = np.array(times), np.array(probabilities)
-        return steps, {link: int(table.lines[numbers[0]]) for link, numbers in rows.items()}
+        lines = {link: int(table.lines[numbers[0]]) for link, numbers in rows.items()}
+        return steps, lines, keys
+
+    def use(self, end: float) -> RowUse:
+        """Return the use of the rows by a run to ``end`` (s): of those that hold in it."""
+        return count_rows(self.path.name, self._steps[2], lambda key: key[1] < end and key[2] > 0.0)
 
     def delivery_probability(self, sent: Transmission) -> Any:
         """Return the probability of the direction at the time of sending."""
@@ -133,8 +148,14 @@ class Hopping(Component):
                 raise ScenarioError("hopping", rule, channel, remedy)
 
     @cached_property
-    def _table(self) -> tuple[Mapping[tuple[int, Link | None], float], dict[Link, int]]:
-        """The deliveries by channel and directed link (None: all), and lines of the links."""
+    def _table(
+        self,
+    ) -> tuple[
+        Mapping[tuple[int, Link | None], float], dict[Link, int], list[tuple[int, Link | None]]
+    ]:
+        """The deliveries by channel and directed link (None: all), lines of the links, and the
+        channel and link of each row.
+        """
         table = _read_deliveries(self.path, ("channel",), ("sender", "receiver"))
         channels: list[int] = table.integers("channel")
         links: list[Link | None] = [None] * len(channels)
@@ -144,16 +165,18 @@ class Hopping(Component):
                 rule = f"{self.path.name} has only one end of the links"
                 raise ScenarioError("path", rule, None, f"add a column {missing[0]}")
             links = list(zip(table.integers("sender"), table.integers("receiver"), strict=True))
-        deliveries: dict[tuple[int, Link | None], float] = {}
+        keys, values = list(zip(channels, links, strict=True)), table["delivery"].tolist()
+        rows = first_rows(table, keys, values, "a channel must have one delivery")
         lines: dict[Link, int] = {}
-        for row, key in enumerate(zip(channels, links, strict=True)):
-            value = float(table["delivery"][row])
-            if deliveries.setdefault(key, value) != value:
-                rule = f"{table.where(row)}: has another delivery than a row before"
-                raise ScenarioError("path", rule, value, "leave one of the two rows out")
-            if key[1] is not None:
-                lines.setdefault(key[1], int(table.lines[row]))
-        return deliveries, lines
+        for (_, link), row in rows.items():
+            if link is not None:
+                lines.setdefault(link, int(table.lines[row]))
+        return {key: values[row] for key, row in rows.items()}, lines, keys
+
+    def use(self, end: float) -> RowUse:
+        """Return the use of the rows by a run to ``end`` (s): of channels in use."""
+        used = self.hopping if end > 0.0 else ()
+        return count_rows(self.path.name, self._table[2], lambda key: key[0] in used)
 
     def delivery(self, sent: Transmission) -> Any:
         """Return the probability that the message ``sent`` arrives on its channel."""
@@ -166,8 +189,14 @@ class Hopping(Component):
     def _per_hop(self, link: Link) -> FloatArray:
         deliveries = self._table[0]
         key = None if (self.hopping[0], None) in deliveries else link
-        return np.array([deliveries.get((channel, key), 0.0) for channel in self.hopping])
+        return np.array([deliveries[channel, key] for channel in self.hopping])
 
     def check(self, topology: Topology) -> None:
-        """Raise ScenarioError unless every pair of the table is a link."""
-        demand_links(self.path, self._table[1], topology)
+        """Raise ScenarioError unless every pair of the table is a link, and each link is there."""
+        deliveries, lines, _ = self._table
+        demand_links(self.path, lines, topology)
+        for channel, link in itertools.product(self.hopping, topology.directions if lines else ()):
+            if (channel, link) not in deliveries:
+                rule = f"{self.path.name} must have a row of each direction on each channel"
+                got = f"none of {list(link)} on {channel}"
+                raise ScenarioError("path", rule, got, "add the row")

@@ -10,6 +10,7 @@ from typing import Any
 from netkf.core.errors import ScenarioError, suggest_nearest
 from netkf.core.fields import SourceFile, rebuild
 from netkf.network.graphs import Graph
+from netkf.plants.blocks import Coupling
 
 Names = Mapping[str, int]
 """The ids of nodes by name."""
@@ -29,14 +30,30 @@ def bind_names(part: Any, names: Names | None) -> Any:
             is_read = value.node_ids == ids or not (ids or value.node_ids or value.unknown)
             return value if is_read else dataclasses.replace(value, node_ids=ids, unknown={})
         rule = field.metadata.get("rule")
-        if rule is None or not rule.of_nodes:
-            return rebuild(value, change)
+        # A word that stands for nodes, as "neighbours", is no name.
+        is_word = isinstance(value, str) and value == field.default
+        if rule is None or not rule.of_nodes or is_word:
+            return _bind_couplings(rebuild(value, change), names)
         # Nodes that were taken from a table are taken again, when it is read again.
         codes = set(getattr(getattr(owner, "path", None), "unknown", {}).values())
         is_taken = isinstance(value, tuple) and bool(codes.intersection(value))
         return None if is_taken else _bind_nodes(value, names)
 
     return rebuild(part, change)
+
+
+def _bind_couplings(value: Any, names: Names | None) -> Any:
+    """Return the couplings of a block with ids of nodes; any other value stays."""
+    if not (isinstance(value, tuple) and value and isinstance(value[0], Coupling)):
+        return value
+    origins = [c.origin for c in value]
+    bound = [
+        origin if isinstance(origin, str) else _bind_nodes(origin, names, f"[{k}].from")
+        for k, origin in enumerate(origins)
+    ]
+    if all(map(operator.is_, origins, bound)):
+        return value
+    return tuple(c._replace(origin=origin) for c, origin in zip(value, bound, strict=True))
 
 
 def _bind_nodes(value: Any, names: Names | None, key: str = "") -> Any:

@@ -10,9 +10,9 @@ import numpy as np
 from netkf.core.clock import generate_ticks
 from netkf.core.csv_files import read_columns
 from netkf.core.errors import ScenarioError, errors_under
+from netkf.core.printable import NamedNode
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.network.clocks import LinkClock
-from netkf.network.graphs import NamedNode
 from netkf.network.node_clocks import node_time, owner_of
 from netkf.network.positions import Positions, PositionTable, read_positions
 from netkf.rng.streams import Streams

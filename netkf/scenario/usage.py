@@ -10,8 +10,11 @@ from netkf.core.repeated_rows import RowUse, count_rows
 from netkf.network.clocks import RecordedClock
 from netkf.network.contacts import Contacts
 from netkf.network.graphs import Link
+from netkf.network.lives import RecordedLife
+from netkf.network.losses import GilbertElliott
 from netkf.network.matchings import RecordedSlots
 from netkf.network.recorded import RecordedDelay, RecordedLoss
+from netkf.network.scheduled import ScheduledLoss
 from netkf.plants.readings import ReadingTable
 from netkf.plants.sampling import RecordedSampling
 from netkf.scenario.derived import DerivedScenario
@@ -57,6 +60,7 @@ def record_usage(scenario: DerivedScenario, sent: Mapping[Link, int] | None) -> 
     if activation_use is not None:
         uses["network.activation"] = _make_use(activation_use)
     channel = scenario.network.channel
+    uses |= {key: _make_use(use) for key, (_, use) in _find_law_uses(scenario).items()}
     for key, component in (("loss", channel.loss), ("delay", channel.delay)):
         if sent is not None and isinstance(component, RecordedLoss | RecordedDelay):
             rows, beyond = component.table.use(sent)
@@ -123,6 +127,7 @@ def repeat_notes(scenario: DerivedScenario) -> tuple[str, ...]:
         for key, use in scenario.topology.tables.items()
     ]
     uses += [(key, "time", use) for key, use in count_plant_rows(scenario).items()]
+    uses += [(key, what, use) for key, (what, use) in _find_law_uses(scenario).items()]
     for key, (what, path, keys) in tables.items():
         uses.append((key, what, count_rows(path, keys, lambda _: True)))
     # A table that several sensors name is told once.
@@ -153,6 +158,25 @@ def _find_activation_use(scenario: DerivedScenario) -> RowUse | None:
         slots = exchange_slots(scenario) if talks else range(0)
         return count_rows(activation.path.name, activation.row_keys, lambda key: key[0] in slots)
     return None
+
+
+def _find_law_uses(scenario: DerivedScenario) -> dict[str, tuple[str, RowUse]]:
+    """Return what rows repeat, and their use, for tables of lives and of laws of losses, by key."""
+    network, end = scenario.network, scenario.end_time
+    uses = {
+        f"network.lives[{k}]": ("node and time", life.use(end))
+        for k, life in enumerate(network.lives)
+        if isinstance(life, RecordedLife)
+    }
+    end = end if scenario.filter.algorithm.timing.talks else 0.0
+    loss, hopping = network.channel.loss, network.channel.channels
+    if isinstance(loss, ScheduledLoss):
+        uses["network.channel.loss"] = "link and interval", loss.use(end)
+    elif isinstance(loss, GilbertElliott) and loss.path is not None:
+        uses["network.channel.loss"] = "link", loss.use(end)
+    if hopping is not None:
+        uses["network.channel.channels"] = "channel", hopping.use(end)
+    return uses
 
 
 def _find_sensor_uses(scenario: DerivedScenario) -> dict[str, RowUse]:

@@ -110,7 +110,7 @@ def _block_table(block: Block, stacked: Plant, style: _Style) -> dict[str, Any]:
     del own["plant"]
     if block.coupling:
         own["coupling"] = [
-            {"from": c.origin if isinstance(c.origin, str) else list(c.origin), "A": c.A.tolist()}
+            {"from": _toml_value(_with_names(c.origin, style), style), "A": c.A.tolist()}
             for c in block.coupling
         ]
     return {**own, **_part_table(plant, style)}
@@ -149,8 +149,8 @@ def _field_values(part: Component, style: _Style) -> dict[str, Any]:
             value is field.default or (not isinstance(value, np.ndarray) and value == field.default)
         )
         rule = field.metadata.get("rule")
-        if style.names and rule is not None and rule.of_nodes:
-            value = map_nodes(value, lambda node: style.names.get(node, node))
+        if rule is not None and rule.of_nodes:
+            value = _with_names(value, style)
         if value is None or (is_default and not with_defaults):
             continue
         table[part._written_keys.get(field.name, field.name)] = _toml_value(value, style)
@@ -159,6 +159,10 @@ def _field_values(part: Component, style: _Style) -> dict[str, Any]:
             for key in ("at", "rates") if isinstance(part, Sensor) else ("at",):
                 table[field.name].pop(key, None)
     return table
+
+
+def _with_names(nodes: Any, style: _Style) -> Any:
+    return map_nodes(nodes, lambda node: style.names.get(node, node)) if style.names else nodes
 
 
 def _toml_value(value: Any, style: _Style) -> Any:

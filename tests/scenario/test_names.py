@@ -9,6 +9,7 @@ import pytest
 import netkf
 from netkf.cli.main import main
 from netkf.scenario.reading import from_table
+from netkf.scenario.writing import resolve_defaults
 
 NAMES = ("lab", "roof", "cellar")
 TABLES = {
@@ -258,6 +259,11 @@ WRONG = {
         {"links.csv": TABLES["links.csv"] + "lab,roof,0.5\n"},
         "lines 2 and 4",
     ),
+    "no outcome of a message": (
+        {},
+        {"lost.csv": "sender,receiver,message,delivered\nlab,roof,0,2\n"},
+        r"one value a message; got \['lab', 'roof', 0, 2\]",
+    ),
     "not GraphML": ({"network.graph": {"kind": "graphml", "path": "ticks.csv"}}, {}, "networkx"),
     "not GML": ({"network.graph": {"kind": "gml", "path": "ticks.csv"}}, {}, "networkx"),
     "no edge list": (
@@ -276,6 +282,31 @@ def test_mistakes_of_names_and_graph_files_are_one_line(name, folder):
     with pytest.raises(netkf.ScenarioError, match=words) as caught:
         from_table(SCENARIO, folder).replace(changes)
     assert len(str(caught.value).splitlines()) == 1
+
+
+def test_blocks_take_names_where_nodes_stand(tmp_path):
+    sampling = {"kind": "periodic", "period": 0.5}
+    block = {"name": "pose", "nodes": ["lab", "roof", "cellar"], **PLANT}
+    absolute = {"of": "pose", "nodes": ["lab"], "sampling": sampling, **SENSOR}
+    relative = {"kind": "relative", "of": "pose", "R": [[0.5]], "sampling": sampling}
+    named = {
+        **{key: SCENARIO[key] for key in ("format", "name", "horizon", "probe")},
+        "plants": [{**block, "coupling": [{"from": ["roof"], "A": [[0.1]]}]}],
+        "sensors": [absolute, {**relative, "nodes": ["lab"], "to": [["lab", "cellar"]]}],
+        "network": {"graph": {"kind": "edges", "edges": [["lab", "roof"], ["roof", "cellar"]]}},
+        "filter": {"kind": "central"},
+    }
+    scenario = from_table(named, tmp_path)
+    with_numbers = from_table(json.loads(with_ids(json.dumps(named))), tmp_path)
+    P = netkf.simulate(with_numbers, engine="simpy").P
+    assert np.array_equal(netkf.simulate(scenario, engine="simpy").P, P)
+    again = from_table(resolve_defaults(scenario), tmp_path)
+    assert np.array_equal(netkf.simulate(again, engine="simpy").P, P)
+    assert P[-1, 0, 2, 2] < 0.9 * P[-1, 0, 1, 1]  # the pair is read
+    named["sensors"][1]["to"] = [["lab", "attic"]]
+    rule = r"sensors\[1\].to\[0\]\[1\]: must name a node of the graph; got 'attic'"
+    with pytest.raises(netkf.ScenarioError, match=rule):
+        from_table(named, tmp_path)
 
 
 def test_edges_of_a_graph_must_agree():

@@ -39,6 +39,8 @@ PLACES = {"network.graph": {"kind": "csv", "path": "links.csv", "positions": "ta
 LISTENING = {"network.activation": {"kind": "broadcast"}, "filter": {"kind": "diffusion"}}
 TRUTH = {"plant": {**CLOCKS["plant"], "kind": "recorded", "path": "table.csv"}}
 SLOT_TRUTH = {"plant": {**SLOTS["plant"], "kind": "recorded", "path": "table.csv"}}
+BURSTS = {"kind": "gilbert-elliott", "mean_loss": 0.1, "mean_burst": 4.0}
+HEAD_OF_INTERVALS = "from,until,sender,receiver,delivery\n"
 HEAD = "sender,receiver,message,"
 
 # Of each kind of table: the scenario, what names the table, its key, its rows, and the numbers of
@@ -129,6 +131,34 @@ REPEATED = {
         "t,x0\n0,1\n1,2\n2,3\n3,4\n4,5\n2,3\n8,5\n8,5\n",
         (5, 1, 2),
     ),
+    "lives": (  # the last row at or before 0 says how a node begins
+        CLOCKS,
+        {"network.lives": [{**RECORDED, "nodes": [1]}]},
+        "network.lives[0]",
+        "t,node,what\n-2,1,down\n-1,1,up\n1,1,down\n2,1,up\n1,1,down\n4,1,down\n",
+        (3, 1, 2),
+    ),
+    "losses that change": (
+        CLOCKS,
+        {"network.channel": {"loss": {**RECORDED, "kind": "scheduled"}}},
+        "network.channel.loss",
+        HEAD_OF_INTERVALS + "0,1,0,1,0.5\n0,1,1,0,0.25\n0,1,0,1,0.5\n4,9,0,1,0\n",
+        (2, 1, 1),
+    ),
+    "bursts": (
+        CLOCKS,
+        {"network.channel": {"loss": {**BURSTS, "path": "table.csv"}, "symmetric": False}},
+        "network.channel.loss",
+        "sender,receiver,mean_loss,mean_burst\n0,1,0.5,2\n1,2,0.5,3\n0,1,0.5,2\n",
+        (2, 1, 0),
+    ),
+    "channels": (
+        CLOCKS,
+        {"network.channel": {"channels": {"hopping": [11, 15], "path": "table.csv"}}},
+        "network.channel.channels",
+        "channel,delivery\n11,0.5\n26,1\n15,0\n11,0.5\n26,1\n",
+        (2, 1, 2),
+    ),
 }
 # The last row says something else about the same thing: the lines that contradict each other.
 CONTRADICTORY = {
@@ -137,6 +167,10 @@ CONTRADICTORY = {
     "links with probabilities": ("1,2,0.25\n", "lines 3 and 5: each direction must be listed once"),
     "positions": ("2,0,6\n", "lines 4 and 7: a node must have one position"),
     "matchings": ("2,2,3\n", "lines 5 and 8: a node may be paired once a slot"),
+    "lives": ("2,1,leave\n", "lines 5 and 8: a node must go up or down once at a time"),
+    "losses that change": ("0,1,1,0,1\n", "lines 3 and 6: a direction must have one delivery"),
+    "bursts": ("1,2,0.5,4\n", "lines 3 and 5: a direction must have one chain"),
+    "channels": ("15,1\n", "lines 4 and 7: a channel must have one delivery"),
     "true states": ("2,9\n", "lines 6 and 13: there may be one row a time"),
     "true states in slots": ("3,9\n", "lines 5 and 10: there may be one row a slot"),
 }

@@ -93,7 +93,8 @@ def steady_state(equations: CoupledRiccati, first: FloatArray | None = None) -> 
     previous = np.inf
     for _ in range(60):
         following = _newton(packed, P)
-        change = float(np.abs(following - P).max() / np.abs(following).max())
+        size = float(np.abs(following).max())
+        change = float(np.abs(following - P).max()) / size if size else 0.0
         P = following
         if change <= 1e-13 or (change <= 1e-9 and change >= 0.5 * previous):
             break
