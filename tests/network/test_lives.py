@@ -514,7 +514,7 @@ def test_theory_says_that_no_bound_is_promised(scenario_of):
 
 REFUSALS = {
     "word": ("t,node,what\n1,1,dwn\n", "l.csv line 2: what must be up, down, join or leave"),
-    "twice": ("t,node,what\n1,1,down\n2,1,down\n", "l.csv line 3: node 1 is down already"),
+    "twice": ("t,node,what\n1,1,down\n2,1,down\n", "l.csv lines 2 and 3: node 1 is down already"),
     "other node": ("t,node,what\n1,0,down\n", "has rows of nodes that are not in nodes"),
 }
 
