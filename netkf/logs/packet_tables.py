@@ -300,7 +300,9 @@ def _match(
             f"merged: stamps of {count_phrase(len(spread), 'transmission')} differ from row to "
             f"row, by {spread.max():g} s at most; the sender's or the first counts"
         )
-    sends = pd.concat([sends, _skipped(sends, notes)])
+    skipped = _skipped(sends, notes)
+    if len(skipped):  # an empty table has no types
+        sends = pd.concat([sends, skipped])
     sends = sends.sort_values(["t", "counter"], kind="stable")
     sends["key"] = sends.index
     sends = sends.reset_index(drop=True)
