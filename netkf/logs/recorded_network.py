@@ -331,7 +331,8 @@ def _recorded_activation(
     if isinstance(activation, Matching):
         slots = np.floor(sends["t"] / scenario.slot_plant.period + 1e-9).astype(int)
         ids = {str(node): int(node) for node in scenario.nodes}
-        pairs = np.sort(sends[["sender", "to"]].replace(ids).to_numpy(dtype=int), axis=1)
+        by_column = [[ids[name] for name in sends[column]] for column in ("sender", "to")]
+        pairs = np.sort(by_column, axis=0).T
         rows = pd.DataFrame({"slot": slots, "node": pairs[:, 0], "peer": pairs[:, 1]})
         table |= {} if activation.phase is None else {"phase": activation.phase}
         return table, rows.drop_duplicates().to_csv(index=False)
