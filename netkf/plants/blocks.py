@@ -455,4 +455,7 @@ def _origins(key: str, coupling: Coupling, place: Place, layout: Layout) -> list
             rule = f"must be nodes with a block {quote(place.name)} or one block in all"
             raise ScenarioError(key, rule, node, "correct the id, or couple by name")
         origins += same
+    if not origins and sum(one.name == place.name for one in layout.places) == 1:
+        rule = "must be other nodes: what drives a block of its own stands in A (in slots F)"
+        raise ScenarioError(key, rule, coupling.origin, "correct the ids, or change the block")
     return origins

@@ -175,8 +175,10 @@ def _targets(
         return
     if not isinstance(sensor.to, str):
         for k, (i, j) in enumerate(sensor.to):
-            if sensor.nodes is None or i in sensor.nodes:
-                yield f"to[{k}]", i, j
+            if sensor.nodes is not None and i not in sensor.nodes:
+                rule = "must begin with one of the nodes of this sensor"
+                raise ScenarioError(f"to[{k}]", rule, i, "add it to nodes, or leave nodes out")
+            yield f"to[{k}]", i, j
         return
     linked: dict[int, set[int]] = {}
     for i, j in topology.links:

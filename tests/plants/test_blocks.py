@@ -304,6 +304,18 @@ def test_heading_of_a_sensor_of_places(tmp_path: Path) -> None:
             "plants[0].coupling[0].A",
             "1",
         ),
+        (
+            "nodes = [1, 2, 3]",
+            "nodes = [1]\ncoupling = [{ from = [1], A = [[1.0]] }]",
+            "plants[0].coupling[0].from",
+            "must be other nodes",
+        ),
+        (
+            "R = [[0.2]]",
+            "R = [[0.2]]\nnodes = [1]\nto = [[1, 2], [2, 3]]",
+            "sensors[1].to[1]",
+            "must begin with one of the nodes",
+        ),
         ("[network]", "[plant]\nkind = 'diffusion'\n[network]", "plant", "beside [[plants]]"),
         ("[[plants]]\n", "[[plants]]\nkind = 'recorded'\npath = 'x.csv'\n", "plants[0]", None),
     ],
