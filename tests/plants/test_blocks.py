@@ -136,14 +136,18 @@ def test_central_filter_of_blocks_solves_the_stacked_riccati_equation(
 
 
 @pytest.mark.parametrize(
-    "filtering",
+    ("filtering", "engine"),
     [
-        'kind = "hybrid"\nepsilon = 0.3',
-        'kind = "covariance-intersection"\nepsilon = 0.3',
-        'kind = "gossip"',
+        # Loops over three states are compiled for this test alone.
+        pytest.param('kind = "hybrid"\nepsilon = 0.3', "compiled", marks=pytest.mark.slow),
+        ('kind = "hybrid"\nepsilon = 0.3', "simpy"),
+        ('kind = "covariance-intersection"\nepsilon = 0.3', "simpy"),
+        ('kind = "gossip"', "simpy"),
     ],
 )
-def test_blocks_are_the_plant_of_all_states_to_the_bit(tmp_path: Path, filtering: str) -> None:
+def test_blocks_are_the_plant_of_all_states_to_the_bit(
+    tmp_path: Path, filtering: str, engine: str
+) -> None:
     blocks = ROBOTS.replace('kind = "central"', filtering)
     clock = 'activation = { kind = "poisson", rate = 5.0 }\n[filter]'
     blocks = blocks.replace("[filter]", clock)
@@ -158,8 +162,6 @@ def test_blocks_are_the_plant_of_all_states_to_the_bit(tmp_path: Path, filtering
             for node, row in zip([1, 2, 2, 3], H, strict=True)
         ),
     ]
-    # Of three states the others would be compiled for this test alone.
-    engine = "compiled" if "hybrid" in filtering else "simpy"
     scenarios = (load(text, tmp_path) for text in (blocks, to_toml(whole)))
     runs = [netkf.simulate(scenario, engine=engine) for scenario in scenarios]
     assert runs[0].fingerprint == runs[1].fingerprint
