@@ -62,7 +62,8 @@ def test_mass_in_nodes_and_under_way_stays(engine, rounds):
     assert run.count("lost") > 0.2 * run.count("send")
     start, end = run.sums["weight"]
     assert start == 5.0
-    assert abs(end - start) < 1e-12 * start
+    # The total of a link grows with the rounds, and with it the size of its last digit.
+    assert abs(end - start) < max(1e-12 * start, np.spacing(rounds / start))
 
 
 ASYMMETRIC = {"loss": {"kind": "bernoulli", "delivery": 0.7}, "symmetric": False}
