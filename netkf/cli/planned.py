@@ -118,11 +118,11 @@ def merge_study(plan: Plan, options: argparse.Namespace) -> int:
         return FAILED
     if len(require_alike(study.installations, plan.directory, options.mixed)) > 1:
         print_notes(["results are of machines of different kinds: last digits may be others"])
-    status = _merge_again(_study_options(plan, options), plan)
-    if status is None:
-        study_options, worker = _study_options(plan, options), Worker(None)
-        status = _run_on(study_options.run, study_options, PlannedStudy(plan.directory, worker))
-    return status
+    status = _merge_again(study_options, plan)
+    if status is not None:
+        return status
+    study = PlannedStudy(plan.directory, Worker(None))
+    return _run_on(study_options.run, study_options, study)
 
 
 def _merge_again(options: argparse.Namespace, plan: Plan) -> int | None:
@@ -143,9 +143,10 @@ def _merge_again(options: argparse.Namespace, plan: Plan) -> int | None:
         return None
     text, notes = io.StringIO(), io.StringIO()
     with TemporaryDirectory() as temporary:
-        options.out = new = Path(temporary) / "out"
+        new = Path(temporary) / "out"
+        anew = argparse.Namespace(**{**vars(options), "out": new})
         with contextlib.redirect_stdout(text), contextlib.redirect_stderr(notes):
-            status = _run_on(options.run, options, PlannedStudy(plan.directory, Worker(None)))
+            status = _run_on(anew.run, anew, PlannedStudy(plan.directory, Worker(None)))
         found = [(folder, _left_out(folder, new)) for folder in folders]
         folder, missing = next((pair for pair in found if pair[1] is not None), (new, None))
         if missing is None:

@@ -226,7 +226,8 @@ class DiffusionPaths:
             laws.append(self.laws.cut_law(*lengths[cut].tolist()))
             pieces.end[row] = pieces.start[row + 1 : stop] = time
         gains, factors, responses = (np.array(part) for part in zip(*laws, strict=True))
-        work, parts = np.empty((4, normals.shape[2])), pieces[2:6]
+        work = np.empty((4, normals.shape[2]))
+        parts = pieces.x_start, pieces.x_end, pieces.moments, pieces.cubic
         split_pieces(rows, normals, gains, factors, responses, lengths, work, parts)
         return pieces
 
