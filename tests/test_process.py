@@ -1,5 +1,6 @@
 """How the process of a command ends: closed streams, signals, text from files."""
 
+import gc
 import os
 import pty
 import re
@@ -295,6 +296,44 @@ def test_commands_import_what_they_need(words, unneeded, tmp_path):
     command = [sys.executable, "-c", UNNEEDED, seen, *words]
     subprocess.run(command, env=plain, capture_output=True, check=False)
     assert not {*unneeded} & {*seen.read_text().split()}
+
+
+QUICK_IMPORTS = """
+import io, sys
+sys.meta_path[:0] = {finders}
+import scipy.sparse, numpy
+from matplotlib.figure import Figure
+seen = {{"numpy.testing._private", "numpy.f2py.crackfortran"}} & {{*sys.modules}}, Figure.set.__doc__
+numpy.testing.assert_allclose([1.0], [1.0])
+with open(sys.argv[1], "wb") as file:
+    figure = Figure(figsize=(2, 2), layout="constrained")
+    figure.add_subplot().set(xlabel="x", title="numbers")
+    figure.savefig(file)
+print(seen)
+"""
+
+
+def test_postponed_imports_work_at_their_first_use(tmp_path):
+    """The same picture, and the same functions, as without the finder."""
+    printed, pictures = [], []
+    for finders in ("[]", "[__import__('netkf.cli.process').cli.process.QuickImports()]"):
+        file = tmp_path / f"{len(printed)}.png"
+        command = [sys.executable, "-c", QUICK_IMPORTS.format(finders=finders), file]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        printed.append(done.stdout)
+        pictures.append(file.read_bytes())
+    assert "Properties" in printed[0]
+    assert printed[1] == "(set(), None)\n"
+    assert pictures[0] == pictures[1]
+
+
+def test_garbage_is_collected_again_after_a_while(monkeypatch):
+    monkeypatch.setattr(process, "KEEPING_SECONDS", 0.01)
+    process.collect_garbage_later()
+    deadline = time.monotonic() + 10.0
+    while not gc.isenabled() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert gc.isenabled()
 
 
 PASSES = """
