@@ -303,7 +303,8 @@ import io, sys
 sys.meta_path[:0] = {finders}
 import scipy.sparse, numpy
 from matplotlib.figure import Figure
-seen = {{"numpy.testing._private", "numpy.f2py.crackfortran"}} & {{*sys.modules}}, Figure.set.__doc__
+unused = {{"numpy.testing._private", "numpy.f2py.crackfortran"}}
+seen = unused & {{*sys.modules}}, Figure.set.__doc__
 numpy.testing.assert_allclose([1.0], [1.0])
 with open(sys.argv[1], "wb") as file:
     figure = Figure(figsize=(2, 2), layout="constrained")
