@@ -109,7 +109,7 @@ class CompiledEngine(Engine):
         """Return the number of runs that take little longer together than one."""
         if not scenario.slotted:
             return quick_runs(scenario)
-        return slot_setup(scenario).quick_runs() if slot_setup(scenario).is_drawn else 1
+        return slot_setup(scenario).quick_runs() if slot_setup(scenario).side_by_side else 1
 
     def run_many(
         self, scenario: Scenario, seed: int, replicas: range, fingerprint: bool = False
@@ -119,8 +119,7 @@ class CompiledEngine(Engine):
         is_mixed = isinstance(scenario.plant.record, StackedStates)
         if not scenario.slotted and not is_mixed:
             yield from flow_batches(scenario, seed, replicas, fingerprint)
-        # Messages made in Python come one run at a time.
-        elif is_mixed or not slot_setup(scenario).is_drawn:
+        elif is_mixed or not slot_setup(scenario).side_by_side:
             yield from alone(replicas, fingerprint)
         else:
             # A run that diverges is repeated alone, since a batch goes on to the end.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,14 +30,21 @@ class LifeTable(NamedTuple):
     restarts: np.ndarray
     down: np.ndarray
 
-    def is_down(self, node: int, times: FloatArray) -> np.ndarray:
-        """Return a mask (T,) of the ``times`` at which the node with this index is down; changes of
-        an instant come before all else.
+    def passed(self, nodes: Any, times: Any) -> IntArray:
+        """Return how many changes of ``nodes`` (indices) came until the ``times``, both of any
+        shapes that fit; changes of an instant come before all else.
         """
-        if not len(self.t) and not self.down.any():
-            return np.zeros(len(times), dtype=bool)
-        passed = np.searchsorted(self.t[self.node == node], times, side="right")
-        down: np.ndarray = (passed + self.down[node]) % 2 == 1
+        nodes, times = np.broadcast_arrays(nodes, times)
+        counts = np.zeros(nodes.shape, dtype=np.int64)
+        for h in np.unique(self.node).tolist():
+            own = nodes == h
+            counts[own] = np.searchsorted(self.t[self.node == h], times[own], side="right")
+        return counts
+
+    def is_down(self, nodes: Any, times: Any) -> np.ndarray:
+        """Return whether ``nodes`` (indices) are down at the ``times``, see ``passed``."""
+        passed = self.passed(nodes, times)
+        down: np.ndarray = (passed + self.down[np.minimum(nodes, len(self.down) - 1)]) % 2 == 1
         return down
 
 

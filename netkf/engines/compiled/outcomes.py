@@ -203,7 +203,7 @@ def list_outcomes(
                     conditions=conditions,
                 )  # fmt: skip
                 of_run[w] = np.full(len(times), OUT_OF_RANGE)
-                of_run[w][heard] = _delays(channel, sent, uniform[heard], delay[heard])
+                of_run[w][heard] = message_delays(channel, sent, uniform[heard], delay[heard])
         outcomes += of_run
     return outcomes
 
@@ -243,7 +243,7 @@ def _sampler(channel: Channel, streams: Streams, ends: Link) -> ChannelSampler:
     return ChannelSampler(channel, ends, lambda purpose: streams.generator(purpose, *ends))
 
 
-def _delays(
+def message_delays(
     channel: Channel, sent: Transmission, uniform: FloatArray, delay: FloatArray
 ) -> FloatArray:
     """Return the outcomes (K,) of the messages ``sent`` on one link."""

@@ -137,29 +137,41 @@ def _free_links(matchings: Matchings, ends: np.ndarray, r: int, active: np.ndarr
 
 
 @kernel
+def draw_pairs(
+    matchings: Matchings,
+    ends: np.ndarray,
+    exchanged: np.ndarray,
+    active: np.ndarray,
+    pair_count: np.ndarray,
+) -> None:
+    """Draw the matchings of R runs in the slots that are ``exchanged`` (S,): the indices of their
+    links into ``active`` (R, S, E, A), and how many there are into ``pair_count`` (R, S, E).
+    """
+    for r in range(len(active)):
+        for s in range(active.shape[1]):
+            for e in range(active.shape[2] if exchanged[s] else 0):
+                pair_count[r, s, e] = draw_matching(matchings, ends, r, active[r, s, e])
+
+
+@kernel
 def draw_messages(
     lanes: Lanes,
     links: SlotChannels,
-    matchings: Matchings,
     exchanged: np.ndarray,
     fresh: np.ndarray,
     messages: SlotMessages,
+    runs: int,
 ) -> None:
-    """Draw which links exchange in the slots that are ``exchanged`` (S,) and which messages arrive,
-    into ``messages``. Links draw losses anew in the steps that are ``fresh`` (E,).
+    """Draw which messages arrive in the slots that are ``exchanged`` (S,), into ``messages``, given
+    the pairs of matchings. Links draw losses anew in the steps that are ``fresh`` (E,).
     """
-    up, runs, matched = messages.up, len(matchings.states), matchings.protocol >= 0
+    up, matched = messages.up, len(messages.pair_count) > 0
     for b in range(up.shape[0]):
         for s in range(up.shape[1]):
             for e in range(up.shape[2] if exchanged[s] else 0):
                 arrived = up[b, s, e]
                 for r in range(b * len(lanes), min((b + 1) * len(lanes), runs)):
-                    count = len(links.ends)
-                    if matched:
-                        active = messages.active[r, s, e]
-                        count = draw_matching(matchings, links.ends, r, active)
-                        messages.pair_count[r, s, e] = count
-                    for a in range(count):
+                    for a in range(messages.pair_count[r, s, e] if matched else len(links.ends)):
                         link = messages.active[r, s, e, a] if matched else a
                         draw_link(links, r, link, fresh[e], e, arrived, r - b * len(lanes))
 

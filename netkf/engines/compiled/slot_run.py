@@ -1,8 +1,8 @@
 """Runs in slots: draw the messages, truth and readings of many slots, then simulate the filters.
 
 A call of a kernel takes S slots of R runs, which are side by side in B blocks of L lanes
-(linalg.lanes). Where channels or clocks are a user's own, or messages take time, Python makes the
-messages of one run at a time (engines.compiled.slot_events).
+(linalg.lanes). Where channels or clocks are a user's own, or messages take time, numpy makes the
+messages of one run at a time (engines.compiled.slot_tables).
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from netkf.engines.base import Progress
 from netkf.engines.compiled.outcomes import channel_streams
 from netkf.engines.compiled.own_sensors import read_whitened
 from netkf.engines.compiled.samples import by_node, record_samples
-from netkf.engines.compiled.slot_events import SlotEvents, absent
 from netkf.engines.compiled.slot_filters import SlotFilters
 from netkf.engines.compiled.slot_loop import WHOLE, SlotSamples
 from netkf.engines.compiled.slot_messages import (
@@ -37,7 +36,6 @@ from netkf.engines.compiled.slot_messages import (
     STOP,
     SWAP,
     TICK,
-    Matchings,
     Rows,
     SlotChannels,
     SlotMessages,
@@ -47,11 +45,14 @@ from netkf.engines.compiled.slot_messages import (
     count_arrivals,
     count_sends,
     draw_messages,
+    draw_pairs,
     draw_uniforms,
     make_rows,
 )
 from netkf.engines.compiled.slot_pairs import matrix_of
 from netkf.engines.compiled.slot_setup import BATCH_BYTES, AssignedSensor, SlotSetup, slot_setup
+from netkf.engines.compiled.slot_steps import StepTimes, absent, step_times
+from netkf.engines.compiled.slot_tables import COLUMNS, SlotTables
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import LANES, MANY, aligned, blocks_of, by_run, in_lanes, unset
 from netkf.linalg.portable import cholesky, solve_lower
@@ -147,7 +148,10 @@ class SlotRuns:
         self.counts = np.zeros((runs, len(KINDS)), dtype=np.int64)
         self._begin_truth()
         self._begin_readings()
-        self._events = None if setup.is_drawn else SlotEvents(scenario, self._first, setup)
+        # Of each run, where kernels cannot draw the messages.
+        self._tables: list[SlotTables] = []
+        if not setup.is_drawn:
+            self._tables = [SlotTables(scenario, one, setup) for one in streams.per_replica]
         self._begin_messages()
 
     def _begin_truth(self) -> None:
@@ -204,19 +208,16 @@ class SlotRuns:
         ]
 
     def _begin_messages(self) -> None:
-        setup, streams, links = self.setup, self._streams, len(self.setup.ends)
+        setup, streams = self.setup, self._streams
         channels = channel_streams(setup.channel, streams, setup.senders, setup.delivery)
         # -1: nothing drawn yet.
         uniform = np.full(len(channels.bad), -1.0)
         self._channels = SlotChannels(
             channels, uniform, setup.ends, setup.talks, setup.directions_per_link
         )
-        protocol, probability, first, members = setup.matching
         if setup.algorithm.timing.randomised:
             self._triggers = streams.states("trigger", [(node,) for node in setup.nodes.tolist()])
-        states = streams.states("matching", [()])
-        order, busy = (np.zeros(size, dtype=np.int64) for size in (links, len(setup.nodes)))
-        self._matchings = Matchings(protocol, probability, states, first, members, order, busy)
+        self._matchings = setup.matchings(streams.states("matching", [()]))
 
     @property
     def over(self) -> bool:
@@ -273,7 +274,7 @@ class SlotRuns:
         }
         unread, begin = self._missed_readings(messages, count), WHOLE
         # Nodes begin again before the first slot of a block.
-        for h in [] if self._events is None else self._events.restarts.get(self._slot, ()):
+        for h in self._tables[0].restarts.get(self._slot, ()) if self._tables else ():
             filters.restart(h, self._moved(h))
 
         def decided(step: int, up: np.ndarray) -> np.ndarray:
@@ -285,9 +286,8 @@ class SlotRuns:
             return sent
 
         # Filters decide who sends, and Python makes the messages: step by step.
-        if self._events is not None and self.setup.decides:
-            _, up = self._events.following(self._max_events, decided)
-            messages.up[..., 0] = up
+        if self._tables and self.setup.decides:
+            messages.up[0, ..., 0] = self._tables[0].following(self._step_times(1), decided)
         filters.simulate(y, H, samples, **drawn, begin=begin, stop=WHOLE)
         if len(messages.sent):
             # Only now, since the kernel decides for all nodes that are asked, readings or not.
@@ -302,21 +302,26 @@ class SlotRuns:
         return self._scenario.prior_shift(self.setup.infos[h].node, slot)
 
     def _next_messages(self, max_events: int, timed: bool) -> tuple[SlotTimes, SlotMessages]:
-        setup, events = self.setup, self._events
-        if events is None:
+        setup, tables = self.setup, self._tables
+        if tables and setup.decides:
+            # One slot at a time: the filters decide who sends before the messages are made.
+            asked = tables[0].asked(self._step_times(1))[None]
+            up = np.zeros((*asked.shape[:2], len(setup.directions)), dtype=np.uint8)
+            return self._next_times(1, True), _pack_messages([up], [asked])
+        count = min(setup.block_slots(self.runs, max_events), setup.slots - self._slot)
+        if not tables:
             # The kernels draw the messages of many slots and runs at once.
-            count = min(setup.block_slots(self.runs, max_events), setup.slots - self._slot)
             times = self._next_times(count, timed)
             return times, self._draw_messages(times)
-        if setup.decides:
-            # One slot at a time: the filters decide who sends before Python makes the messages.
-            sent = events.asked()
-            up = np.zeros((1, 1, len(sent), len(setup.directions)), dtype=np.uint8)
-            return self._next_times(1, True), _pack_messages(up, sent[None, None])
-        count, up = events.following(max_events, None)
-        awake = events.awake
-        sent = awake[None] if len(awake) else np.zeros((0,) * 4, dtype=np.uint8)
-        return self._next_times(count, True), _pack_messages(up, sent)
+        # Nodes begin again before the first slot of a block.
+        ends = (slot - self._slot for slot in tables[0].restarts if slot > self._slot)
+        count = min([count, *ends]) if setup.forgets else count
+        steps = self._step_times(count)
+        arrived = [one.following(steps, with_rows=timed and r == 0) for r, one in enumerate(tables)]
+        return self._next_times(count, True), _pack_messages(arrived, [one.awake for one in tables])
+
+    def _step_times(self, count: int) -> StepTimes:
+        return step_times(self._scenario, self.setup, self._slot, count)
 
     def _empty_samples(self, count: int) -> SampledStates:
         """Return space for ``count`` samples of all R runs, in memory that is reused."""
@@ -382,7 +387,11 @@ class SlotRuns:
         )
         if not len(setup.directions):
             return messages
-        draw_messages(MANY, self._channels, self._matchings, times.exchanged, setup.fresh, messages)
+        if matched:
+            draw_pairs(
+                self._matchings, setup.ends, times.exchanged, messages.active, messages.pair_count
+            )
+        draw_messages(MANY, self._channels, times.exchanged, setup.fresh, messages, self.runs)
         if decided:
             self._mark_senders(messages, times.exchanged)
         # No chosen messages at all: the run as it was.
@@ -552,12 +561,20 @@ class SlotRuns:
             setup.nonlinear.raise_error()
         if (self._recorded or self._own) and times.sensed.any():
             self._read_in_python(times, x, y, H)
-        if self._events is not None and self._scenario.network.lives:
-            down = absent(self._scenario, setup, self._events.lives, self._slot, count)
-            y[:, down] = H[:, down] = 0.0
-            for s in setup.nonlinear_sensors:
-                y[:, down[:, s.estimator], s.estimator, s.row : s.row + s.rows] = np.nan
+        if self._scenario.network.lives:
+            self._silence(y, H)
         return y, H
+
+    def _silence(self, y: FloatArray, H: FloatArray) -> None:
+        """Take away the readings of nodes that are down."""
+        setup, count = self.setup, y.shape[1]
+        for r, tables in enumerate(self._tables):
+            down = absent(self._scenario, setup, tables.lives, self._slot, count)
+            b, lane = divmod(r, LANES)
+            y[b, ..., lane][down] = H[b, ..., lane][down] = 0.0
+            for s in setup.nonlinear_sensors:
+                rows = y[b, :, s.estimator, s.row : s.row + s.rows, lane]
+                rows[down[:, s.estimator]] = np.nan
 
     def _read_in_python(
         self, times: SlotTimes, x: FloatArray, y: FloatArray, H: FloatArray
@@ -678,14 +695,17 @@ class SlotRuns:
         """Return the EVENT rows (K,) of a block of one run, and the number of rows before each of
         its samples, (T,).
         """
-        # Where Python made the messages it knows the events, but not in which slot nodes stopped.
-        if self._events is not None:
-            return self._events.rows(self._stopped[0, :, 0])
+        # Tables know the events, but not in which slot nodes stopped.
+        if self._tables:
+            return self._tables[0].events(block.sampled, self._stopped[0, :, 0])
         before_sample = np.zeros(len(block.sampled), dtype=np.int64)
         return self._rows(block, 0, len(block.times.start), before_sample), before_sample
 
     def first_events(self, block: SlotBlock) -> Iterator[np.ndarray]:
         """Yield the EVENT rows of the first run of a batch in a block, for some slots at a time."""
+        if self._tables:
+            yield self.events(block)[0]
+            return
         size = max(1, LONG // max(1, self.setup.rows_of(1)))
         # Samples of a batch are counted from the first of the run.
         before_sample = np.zeros(len(self.setup.samples), dtype=np.int64)
@@ -700,7 +720,7 @@ class SlotRuns:
         # Space for the largest number of rows.
         table = np.empty(setup.rows_of(stop - first), dtype=EVENT)
         # Kernels write the columns where the records have them.
-        columns: Any = [table[name] for name in ROW_COLUMNS]
+        columns: Any = [table[name] for name in COLUMNS]
         nodes = TracedNodes(setup.nodes, setup.sensing, setup.links, self._sent, self._stopped)
         trace = Tracing(
             setup.stages, block.times, self._channels, nodes, block.messages,
@@ -711,6 +731,18 @@ class SlotRuns:
 
     def count_events(self, block: SlotBlock) -> None:
         """Add the events of a block to ``self.counts`` (R, KINDS)."""
+        setup, times, counts = self.setup, block.times, self.counts
+        for r, tables in enumerate(self._tables):
+            stopped = counts[r, STOP]
+            counts[r] = tables.counts
+            counts[r, STOP] = stopped
+        if not self._tables:
+            self._count_drawn(block)
+        if setup.stages.stopping >= 0:
+            since = by_run(self._stopped, self.runs) - times.first
+            counts[:, STOP] += ((since >= 0) & (since < times.recorded.sum())).sum(axis=1)
+
+    def _count_drawn(self, block: SlotBlock) -> None:
         setup, times, messages, counts = self.setup, block.times, block.messages, self.counts
         recorded, pairwise = times.recorded, setup.algorithm.timing.pairwise
         sensed, exchanged = recorded & times.sensed, recorded & times.exchanged
@@ -732,9 +764,6 @@ class SlotRuns:
         counts[:, DELIVER] += arrived
         counts[:, LOST] = counts[:, SEND] - counts[:, DELIVER]
         counts[:, SWAP if pairwise else ABSORB] += arrived if pairwise else receiving
-        if setup.stages.stopping >= 0:
-            since = by_run(self._stopped, self.runs) - times.first
-            counts[:, STOP] += ((since >= 0) & (since < recorded.sum())).sum(axis=1)
 
     def conserved(self) -> dict[str, FloatArray]:
         """Return by name the sums that exchanges conserve: (R, 2), at the start and at the end."""
@@ -754,16 +783,18 @@ class SlotRuns:
         }
 
 
-def _pack_messages(up: np.ndarray, sent: np.ndarray) -> SlotMessages:
-    lane_arrays = [np.zeros((*values.shape, LANES), dtype=np.uint8) for values in (up, sent)]
-    for lanes, values in zip(lane_arrays, (up, sent), strict=True):
-        lanes[..., 0] = values
+def _pack_messages(up: list[np.ndarray], sent: list[np.ndarray]) -> SlotMessages:
+    """Return the messages of runs as those of lanes."""
+    lane_arrays = []
+    for of_runs in (up, sent):
+        blocks = blocks_of(len(of_runs)) if len(of_runs[0]) else 0
+        lanes = np.zeros((blocks, *of_runs[0].shape, LANES), dtype=np.uint8)
+        for r, values in enumerate(of_runs if blocks else ()):
+            lanes[r // LANES, ..., r % LANES] = values
+        lane_arrays.append(lanes)
     # The arrays of matched pairs stay empty: only kernels that draw messages use them.
     active, pairs = (np.zeros((0,) * d, dtype=np.int64) for d in (4, 3))
     return SlotMessages(up=lane_arrays[0], active=active, pair_count=pairs, sent=lane_arrays[1])
-
-
-ROW_COLUMNS = ("t", "kind", "node", "peer", "message", "phase", "age")
 
 
 def run_slots(scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress) -> str:

@@ -24,6 +24,7 @@ from netkf.engines.compiled.slot_messages import (
     NODE_WAKEUP,
     ONE_EDGE,
     UNIFORM_MAXIMAL,
+    Matchings,
     SlotLinks,
     Stages,
 )
@@ -415,6 +416,17 @@ class SlotSetup:
         return self.has_known_probabilities and network.channel.delay.fixed == 0.0 and exchanges
 
     @property
+    def side_by_side(self) -> bool:
+        """True if several runs can be simulated in one call: all make the same steps."""
+        return self.is_drawn or not (self.decides or self.forgets)
+
+    def matchings(self, states: np.ndarray) -> Matchings:
+        """Return the matching protocol with the streams ``states`` (R, WIDTH) of R runs."""
+        protocol, probability, first, members = self.matching
+        scratch = (np.zeros(size, dtype=np.int64) for size in (len(self.ends), len(self.nodes)))
+        return Matchings(protocol, probability, states, first, members, *scratch)
+
+    @property
     def max_pairs(self) -> int:
         """The largest number of pairs in a matching, 0 without matchings."""
         return min(len(self.nodes) // 2, len(self.ends)) if self.matching[0] >= 0 else 0
@@ -453,6 +465,9 @@ class SlotSetup:
         # A power of two, so that a batch is one node of the merge tree; at least a block of lanes,
         # unless not even that fits.
         runs_in_memory = min(BATCH_BYTES // sample_bytes, BLOCK_BYTES // (8 * self.bytes_of_slot()))
+        if not self.is_drawn:
+            # Runs keep the random streams of their links.
+            runs_in_memory = min(runs_in_memory, MAX_STREAMS // max(1, len(self.directions)))
         power = 1 << max(0, int(min(runs_in_memory, MAX_SLOT_RUNS)).bit_length() - 1)
         return int(min(max(power, LANES), max(1, MAX_BLOCK_BYTES // sample_bytes)))
 
@@ -493,6 +508,8 @@ them once and in order, which costs less than more calls would.
 BATCH_BYTES, MAX_BLOCK_BYTES, MAX_SLOT_RUNS = 1 << 26, 1 << 29, 1024
 """Limits of a batch in slots: bytes of its samples, the same if it is only a block of lanes, and
 runs."""
+MAX_STREAMS = 1 << 14
+"""Links of a batch whose messages are tables, with random streams that Python keeps."""
 QUICK_FLOPS = 1 << 25
 """Floating-point operations that take some ten milliseconds."""
 

@@ -19,10 +19,10 @@ import numpy as np
 from netkf.algorithms.filter import compiled_kernels
 from netkf.algorithms.records import make_records
 from netkf.engines.compiled.life_tables import LifeTable, life_table
-from netkf.engines.compiled.slot_events import Step, absent, slot_restarts, steps_of
 from netkf.engines.compiled.slot_filters import SlotFilters
 from netkf.engines.compiled.slot_loop import WHOLE, SlotSamples
 from netkf.engines.compiled.slot_setup import SlotSetup, slot_setup
+from netkf.engines.compiled.slot_steps import Step, absent, slot_restarts, steps_of
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.linalg.lanes import LANES, blocks_of
 from netkf.rng.streams import Streams

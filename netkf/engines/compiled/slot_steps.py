@@ -1,0 +1,90 @@
+"""The steps of the exchanges in slots: when they are, and who is down then."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.engines.compiled.life_tables import LifeTable
+from netkf.engines.compiled.slot_setup import SlotSetup
+from netkf.linalg.arrays import FloatArray
+from netkf.scenario.scenario import Scenario
+
+
+class Step(NamedTuple):
+    """One step of an exchange: the number of the ``step`` in its slot, its ``phase``, and its times
+    in seconds.
+    """
+
+    step: int
+    phase: int
+    begin: float
+    end: float
+
+
+class StepTimes(NamedTuple):
+    """Times in seconds of S slots from number ``first`` on, with E steps each.
+
+    start : (S,), when the slots begin
+    begin, end : (S, E), when the steps of their exchanges do, and when inboxes close
+    exchanged, recorded : (S,) bool, whether nodes exchange, and whether events are recorded
+    """
+
+    first: int
+    start: FloatArray
+    begin: FloatArray
+    end: FloatArray
+    exchanged: np.ndarray
+    recorded: np.ndarray
+
+    def of_stage(self, setup: SlotSetup, stage: int) -> FloatArray:
+        """Return (S,) when the readings are made that are a ``stage`` of the slots."""
+        before = setup.stages.step[:stage].max(initial=-1)
+        if before < 0:
+            return self.start
+        return np.where(self.exchanged, self.end[:, before], self.start)
+
+
+def step_times(scenario: Scenario, setup: SlotSetup, first: int, count: int) -> StepTimes:
+    """Return the times of ``count`` slots."""
+    timing, slots = scenario.node_filter.timing, np.arange(first, first + count)
+    start = np.array([scenario.slot_plant.slot_time(slot) for slot in slots.tolist()])
+    # The ends of steps are counted from the start of the slot.
+    end = scenario.time_grid.snap(start[:, None] + setup.stages.end[setup.stages.step >= 0])
+    begin = np.concatenate([start[:, None], end[:, :-1]], axis=1)[:, : end.shape[1]]
+    recorded = slots < setup.last
+    # At the horizon filters that predict are only sampled.
+    acts = recorded | (not timing.predicts)
+    exchanged = acts & timing.talks & (slots >= timing.first_exchange)
+    return StepTimes(first, start, begin, end, exchanged, recorded)
+
+
+def steps_of(scenario: Scenario, setup: SlotSetup, slot: int) -> Iterator[Step]:
+    """Yield the steps of the exchanges of a slot."""
+    times = step_times(scenario, setup, slot, 1)
+    if times.exchanged[0]:
+        ends = zip(times.begin[0].tolist(), times.end[0].tolist(), strict=True)
+        for step, (begin, end) in enumerate(ends):
+            yield Step(step, setup.phases[step], begin, end)
+
+
+def absent(
+    scenario: Scenario, setup: SlotSetup, lives: LifeTable, first: int, count: int
+) -> np.ndarray:
+    """Return (S, N) bool: nodes that are down when the others read, in ``count`` slots from
+    ``first`` on.
+    """
+    reads = int(np.argmax(setup.stages.step < 0))
+    times = step_times(scenario, setup, first, count).of_stage(setup, reads)
+    return lives.is_down(np.arange(len(setup.nodes)), times[:, None])
+
+
+def slot_restarts(scenario: Scenario, lives: LifeTable) -> dict[int, list[int]]:
+    """Return by slot the indices of the nodes that begin again when it begins."""
+    found: dict[int, list[int]] = {}
+    slots = scenario.slot_plant.slots_of(lives.t[lives.restarts])
+    for slot, h in zip(slots.tolist(), lives.node[lives.restarts].tolist(), strict=True):
+        found.setdefault(slot, []).append(h)
+    return found
