@@ -251,8 +251,12 @@ def message_delays(
     if delay_depends_on_message(channel.delay):
         delay = delay.copy()
         # A delay is asked only for messages that arrive.
+        distance = np.broadcast_to(sent.distance, lost.shape)
         for k in np.flatnonzero(~lost).tolist():
-            one = sent._replace(number=k, time=float(sent.time[k]), bad=bool(sent.bad[k]))
+            one = sent._replace(
+                number=int(sent.number[k]), time=float(sent.time[k]), bad=bool(sent.bad[k]),
+                distance=float(distance[k]),
+            )  # fmt: skip
             delay[k] = checked_delay(channel.delay, one, float(delay[k]))
     return np.where(lost, LOST, delay)
 
