@@ -1,5 +1,5 @@
-"""Messages in slots that kernels do not draw, drawn at random from all that a network can have: both
-engines make one run, and batches hold the single runs.
+"""Messages in slots that kernels do not draw, drawn from all that a network can have: both engines
+make one run, and batches hold the single runs.
 """
 
 import math

@@ -82,6 +82,7 @@ class Uses(NamedTuple):
     w : (D,), the directed link
     up : (D,) bool, whether recorded exchanges say that it is up
     near : (D,) bool, whether its ends are near enough to hear each other
+    distance : (D,), of its ends, where losses follow it and nodes move
     uniform, bad, delay : (D,), what was drawn: a uniform number, the state (1: bad), seconds
     """
 
@@ -91,6 +92,7 @@ class Uses(NamedTuple):
     w: IntArray
     up: np.ndarray
     near: np.ndarray
+    distance: FloatArray
     uniform: FloatArray
     bad: FloatArray
     delay: FloatArray
@@ -272,7 +274,9 @@ class SlotTables:
         draws = self._draws.rows(senders.source[w], number)
         if self._shared is not None:
             self._share(slot * len(self._setup.fresh) + step, self._sender[w], fresh, draws)
-        uses = Uses(slot, step, place, w, ups, np.ones(len(w), dtype=bool), *draws)
+        uses = Uses(
+            slot, step, place, w, ups, np.ones(len(w), dtype=bool), np.full(len(w), NAN), *draws
+        )
         self._links = []
         if self._reach is not None:
             self._look(times, uses)
@@ -362,8 +366,10 @@ class SlotTables:
                 step = int(uses.step[d])
                 self._part = self._part_of(s, step) if times.recorded[s] else -1
                 pair = ends[uses.w[d] // each]
-                near = reach.connects(pair[0], pair[1], float(times.begin[s, step]))
-                uses.near[d : d + each] = near
+                now = float(times.begin[s, step])
+                uses.near[d : d + each] = reach.connects(pair[0], pair[1], now)
+                if self._follows:
+                    uses.distance[d : d + each] = reach.distance(pair[0], pair[1], now)
             self._part = part + self._parts - 1
             now = float(times.of_stage(setup, len(setup.stages.step))[s])
             if sampled[s] and not self._timing.predicts and now < horizon:
@@ -404,7 +410,7 @@ class SlotTables:
         w = uses.w
         number = numbers_of(w, np.ones(len(w), dtype=bool), self._sent_so_far)
         begin, closes = times.begin[uses.slot, uses.step], times.end[uses.slot, uses.step]
-        delay = self._grid.snap(self._delays(uses, number, begin, times))
+        delay = self._grid.snap(self._delays(uses, number, begin))
         arrival, receiver = self._grid.snap(begin + delay), self._receiver[w]
         lost, absorbed = np.zeros(len(w), dtype=bool), arrival <= closes
         if self._scenario.network.lives:
@@ -416,9 +422,7 @@ class SlotTables:
         up[uses.slot[here], uses.step[here], w[here]] = 1
         return Messages(*uses[:4], number, begin, arrival, closes, lost, absorbed)
 
-    def _delays(
-        self, uses: Uses, number: IntArray, begin: FloatArray, times: StepTimes
-    ) -> FloatArray:
+    def _delays(self, uses: Uses, number: IntArray, begin: FloatArray) -> FloatArray:
         """Return the seconds (K,) that messages take, nan if lost."""
         uniform, bad, drawn = uses.uniform, uses.bad, uses.delay
         if self._delivery is not None:
@@ -432,20 +436,9 @@ class SlotTables:
             one = one[uses.up[one]]
             sent = self._first[w]._replace(number=number[one], time=begin[one], bad=bad[one] == 1.0)
             if self._follows:
-                sent = sent._replace(distance=self._distances(w, uses.slot[one], begin[one], times))
+                sent = sent._replace(distance=uses.distance[one])
             delays[one] = message_delays(self._channel, sent, uniform[one], drawn[one])
         return np.where(delays >= 0.0, delays, NAN)
-
-    def _distances(
-        self, w: int, slots: IntArray, begin: FloatArray, times: StepTimes
-    ) -> FloatArray:
-        """Return how far the ends of a directed link are apart, (K,)."""
-        reach, found = self._reach, []
-        assert reach is not None
-        for slot, now in zip(slots.tolist(), begin.tolist(), strict=True):
-            reach.slot = times.first + slot
-            found.append(reach.distance(*self._setup.directions[w], now))
-        return np.array(found)
 
     def _count(
         self, starts: list[Rows], messages: Messages, recorded: np.ndarray, steps: int
