@@ -38,6 +38,7 @@ from netkf.theory import (
     steady_covariance_bound,
 )
 from netkf.theory.hybrid.coupled import coupling, reason_without_bound
+from netkf.theory.hybrid.dense import SparseOrFull
 from netkf.theory.hybrid.second_moments import second_moment_rate
 from netkf.theory.hybrid.steady import has_steady_state
 from netkf.theory.numerics.matrices import undetectable_mode
@@ -199,7 +200,7 @@ def _mixing_factor(scenario: Scenario) -> float:
     return max(1.0, 100.0 * float(max(speeds)) / slowest)
 
 
-def _slowest_mixing(mixing: scipy.sparse.csr_array) -> float:
+def _slowest_mixing(mixing: SparseOrFull) -> float:
     """Return the rate (1/s) at which differences between nodes decay under exchanges alone."""
     leaving = np.asarray(mixing.sum(axis=1)).reshape(-1)
     laplacian = scipy.sparse.csc_array(scipy.sparse.diags_array(leaving) - mixing)

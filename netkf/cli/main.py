@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # here would make matplotlib raise ValueError.
         os.environ["MPLBACKEND"] = "agg"
         # Threads of OpenBLAS that wait for the next product would spin for 30 ms after each.
-        os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "16")
+        os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "10")
         run_as_process(partial(_run_command, sys.argv[1:]))
     with Interruption() as interruption:
         return _run_command(arguments, interruption)

@@ -15,6 +15,7 @@ from netkf.network.graphs import node_columns
 from netkf.network.lives import Lifetime
 from netkf.network.matchings import RecordedSlots
 from netkf.network.recorded import RecordedLoss
+from netkf.network.spectra import connected_parts
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import Sink
 from netkf.trace.schema import CODES, EVENT
@@ -25,6 +26,8 @@ intervals between messages.
 """
 MAX_AT_ONCE = 1 << 24
 """Links times samples that are looked at together."""
+MAX_FULL = 64
+"""Nodes up to which parts are found in a full matrix: importing scipy.sparse takes longer."""
 
 
 class ConnectivitySink(Sink):
@@ -120,11 +123,12 @@ class ConnectivitySink(Sink):
             for k, part in enumerate(topology.components):
                 labels[[topology.index[node] for node in part]] = k
             return len(topology.components), labels
-        graph = scipy.sparse.coo_array(
-            (np.ones(len(ends[0])), (ends[0], ends[1])), shape=(size, size)
-        )
-        count, labels = scipy.sparse.csgraph.connected_components(graph, connection=self._strength)
-        return int(count), np.asarray(labels)
+        if size <= MAX_FULL:
+            graph: Any = np.zeros((size, size))
+            graph[ends[0], ends[1]] = 1.0
+        else:
+            graph = scipy.sparse.coo_array((np.ones(len(ends[0])), tuple(ends)), shape=(size, size))
+        return connected_parts(graph, self._strength)
 
     def _look(self, t: FloatArray, links: np.ndarray) -> None:
         """Count the samples at ``t`` (T,), when these ``links`` (T, D) are up if their ends are."""

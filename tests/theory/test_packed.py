@@ -7,7 +7,8 @@ import scipy.linalg
 import scipy.sparse
 
 from netkf import theory
-from netkf.theory.hybrid import bounds, linearised
+from netkf.network.spectra import connected_parts
+from netkf.theory.hybrid import bounds, coupled, dense, linearised, steady
 from netkf.theory.hybrid.coupled import CoupledRiccati
 from netkf.theory.hybrid.packed import PackedRiccati
 from netkf.theory.hybrid.samples import PoissonSamples
@@ -163,3 +164,89 @@ def test_a_bound_without_stiffness_takes_few_steps(random_graph, monkeypatch):
     exponential = scipy.linalg.expm(np.block([[-A, np.eye(4)], [np.zeros((4, 4)), A.T]]) * 2.0)
     F = exponential[4:, 4:].T
     near(grown, np.broadcast_to(F @ F.T + F @ exponential[:4, 4:], grown.shape), 1e-10)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.2])
+def test_few_nodes_in_full_matrices_have_the_results_of_sparse_ones(delay):
+    """The sparse ones are solved by scipy's SuperLU."""
+    e, random = equations(delay), np.random.default_rng(4)
+    H, nodes = random.normal(size=(3, 1, n)), np.array([1, 4, 4])
+    heard = scipy.sparse.csr_array(random.uniform(size=(N, 3)))
+    group = PoissonSamples(nodes, H, np.ones((3, 1, 1)), np.array([1.0, 3.0, 2.0]), heard)
+    full = dense.full_matrix(N, N)
+    full[:] = e.coupling.toarray()
+    linears = []
+    for one, rates in ((e, heard), (e._replace(coupling=full), heard.toarray())):
+        samples = (group._replace(heard=np.asarray(rates).view(dense.FullMatrix)),)
+        packed = PackedRiccati(one._replace(samples=samples if one is not e else (group,)))
+        linears.append((packed, packed.linear(e.start)))
+    (sparse, linear), (packed, full_linear) = linears
+    assert packed.is_full
+    assert not sparse.is_full
+    near(full_linear.full_matrix(), linear.matrix().toarray())
+    near(packed.slope(packed.start, packed.start), sparse.slope(sparse.start, sparse.start))
+    right = packed.pack(equations(seed=2).start)
+    near(linearised.solve_map(full_linear, right), linearised.solve_map(linear, right), 1e-11)
+
+
+@pytest.fixture
+def both_ways(monkeypatch):
+    def compute(function):
+        results = []
+        for unknowns in (0, dense.MAX_UNKNOWNS):
+            monkeypatch.setattr(dense, "MAX_UNKNOWNS", unknowns)
+            coupled.coupling.cache_clear()
+            steady._steady_state_of.cache_clear()
+            results.append(function())
+        return results
+
+    return compute
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.1])
+def test_bounds_and_limits_of_few_nodes_are_those_of_sparse_matrices(build, both_ways, delay):
+    delays = {"delay": {"kind": "constant", "seconds": delay}} if delay else {}
+    scenario = build(
+        plant={"kind": "diffusion", "A": [[0.1, 1.0], [-1.0, 0.1]], "B": [[1.0], [0.5]]},
+        sensors=[{"nodes": [0, 2], "H": [[1.0, 0.0]], "R": [[0.25]]}],
+        network={
+            "graph": {"kind": "edges", "nodes": 5, "edges": [[0, 1], [1, 2], [2, 3], [3, 4]]},
+            "activation": {"kind": "poisson", "at": "nodes", "rate": 8.0},
+            "channel": {"loss": {"kind": "bernoulli", "delivery": 0.5}, **delays},
+        },
+        filter={"kind": "hybrid", "epsilon": 0.2},
+    )
+    sparse, full = both_ways(
+        lambda: (
+            theory.covariance_bound(scenario, [0.0, 1.0, 3.0]),
+            theory.steady_covariance_bound(scenario),
+            theory.limit_covariance(scenario),
+        )
+    )
+    for got, expected in zip(full, sparse, strict=True):
+        near(got, expected)
+
+
+def test_riccati_equations_of_few_states_have_the_solutions_of_scipy():
+    for seed in range(24):
+        random = np.random.default_rng(seed)
+        size = 1 + seed % dense.MAX_STATES
+        A, B, C = (random.normal(size=(size, size)) for _ in range(3))
+        A[0] *= 10.0 ** (seed % 3)  # states in units of their own
+        Q, G = B @ B.T, C[:1].T @ C[:1]
+        expected = scipy.linalg.solve_continuous_are(A.T, C[:1].T, Q, np.eye(1))
+        got = dense.steady_riccati(A, Q, G)
+        terms = np.abs(A @ got).max() + np.abs(got @ G @ got).max()
+        assert np.abs(A @ got + got @ A.T + Q - got @ G @ got).max() <= 1e-11 * terms
+        near(got, expected, 1e-7)
+
+
+@pytest.mark.parametrize("connection", ["strong", "weak"])
+def test_the_parts_of_full_graphs_are_those_that_scipy_finds(connection):
+    random = np.random.default_rng(0)
+    for size in (1, 2, 7, 40):
+        graph = (random.uniform(size=(size, size)) < 1.2 / size) * 0.5
+        count, part = connected_parts(graph, connection)
+        expected, other = connected_parts(scipy.sparse.csr_array(graph), connection)
+        assert count == expected
+        assert len({*zip(part.tolist(), other.tolist(), strict=True)}) == count

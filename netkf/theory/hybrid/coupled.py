@@ -11,7 +11,7 @@ terms and jumps, see theory/hybrid/samples.py.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -20,11 +20,14 @@ from netkf.algorithms.registry import overridden
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.network.clocks import LinkClock
+from netkf.network.spectra import connected_parts
 from netkf.plants.transitions import Transitions
 from netkf.scenario.registry import kind_name
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import no_channel_law, nonlinear_rows
 from netkf.theory.common.observations import increment_observations
+from netkf.theory.hybrid import dense
+from netkf.theory.hybrid.dense import FullMatrix, SparseOrFull, full_matrix, solve_or_nan
 from netkf.theory.hybrid.samples import (
     PoissonSamples,
     SampleJump,
@@ -44,7 +47,7 @@ class CoupledRiccati(NamedTuple):
 
     A, Q     : (n, n) drift and noise that the filters assume
     G        : (N, n, n) information of increments per second
-    coupling : (N, N) sparse, c_ij per second
+    coupling : (N, N) sparse, or a FullMatrix if small, c_ij per second
     T, q     : (n, n) prediction over the delay
     delay    : seconds
     start    : (N, n, n) P at 0
@@ -55,7 +58,7 @@ class CoupledRiccati(NamedTuple):
     A: FloatArray
     Q: FloatArray
     G: FloatArray
-    coupling: scipy.sparse.csr_array
+    coupling: SparseOrFull
     T: FloatArray
     q: FloatArray
     delay: float
@@ -74,7 +77,7 @@ class CoupledRiccati(NamedTuple):
         return self._replace(
             G=self.G[node : node + 1],
             start=self.start[node : node + 1],
-            coupling=scipy.sparse.csr_array((1, 1)),
+            coupling=full_matrix(1, 1),
             samples=tuple(s.restrict(node) for s in self.samples),
             jumps=tuple(
                 SampleJump(jump.time, {0: jump.observations[node]}, None)
@@ -166,14 +169,19 @@ def increment_informations(scenario: Scenario) -> FloatArray:
 
 
 @lru_cache(maxsize=4)
-def coupling(scenario: Scenario) -> scipy.sparse.csr_array:
-    """Return c (N, N), sparse: rates (1/s) of arrivals from j at i times weights; one object."""
+def coupling(scenario: Scenario) -> SparseOrFull:
+    """Return c (N, N): rates (1/s) of arrivals from j at i times weights; one object."""
     index, size = scenario.topology.index, len(scenario.nodes)
     rates = {} if transmits_at_samples(scenario) else scenario.effective_rates()
     # Losses thin the Poisson process of arrivals: the effective rate counts what arrives.
     heard = {pair: rate for pair, rate in rates.items() if rate > 0.0}
     values = np.array([rate * scenario.weight(i, j) for (j, i), rate in heard.items()])
     indices = np.array([(index[i], index[j]) for j, i in heard], dtype=np.int64).reshape(-1, 2)
+    n = scenario.plant.n
+    if size * n * (n + 1) // 2 <= dense.MAX_UNKNOWNS:
+        full = full_matrix(size, size)
+        full[indices[:, 0], indices[:, 1]] = values
+        return full
     entries = scipy.sparse.coo_array((values, (indices[:, 0], indices[:, 1])), shape=(size, size))
     matrix = scipy.sparse.csr_array(entries)
     matrix.eliminate_zeros()
@@ -217,7 +225,7 @@ def has_balanced_rates(scenario: Scenario) -> bool | None:
     return _is_symmetric(coupling(scenario))
 
 
-def _is_symmetric(c: scipy.sparse.csr_array) -> bool:
+def _is_symmetric(c: SparseOrFull) -> bool:
     difference, size = abs(c - c.T), abs(c.T)
     return bool(difference.max() <= EQUAL_RATES * size.max())
 
@@ -244,14 +252,14 @@ def left_weights(scenario: Scenario) -> FloatArray:
     if heard is None:
         raise TheoryError("the messages that arrive do not join all nodes")
     w = np.zeros(c.shape[0])
-    w[heard] = _stationary(scipy.sparse.csr_array(c[heard][:, heard]))
+    w[heard] = _stationary(c[heard][:, heard])
     return w
 
 
-def _heard_by_all(c: scipy.sparse.csr_array) -> np.ndarray | None:
+def _heard_by_all(c: SparseOrFull) -> np.ndarray | None:
     """Return the nodes (K,) heard by all others by way of the rates c, or None."""
     # Row i of c has the senders that node i receives from.
-    count, part = scipy.sparse.csgraph.connected_components(c, connection="strong")
+    count, part = connected_parts(c, "strong")
     hears, heard = c.nonzero()
     outside = part[hears] != part[heard]
     # Components without arrivals from other components.
@@ -259,17 +267,23 @@ def _heard_by_all(c: scipy.sparse.csr_array) -> np.ndarray | None:
     return np.flatnonzero(part == closed[0]) if len(closed) == 1 else None
 
 
-def _stationary(c: scipy.sparse.csr_array) -> FloatArray:
+def _stationary(c: SparseOrFull) -> FloatArray:
     """Return the weights w (M,) of fast links, ``w (D - c) = 0``; raises TheoryError."""
     size = c.shape[0]
     if size == 1 or _is_symmetric(c):
         return np.full(size, 1.0 / size)
     leaving = np.asarray(c.sum(axis=1)).reshape(-1)
-    transposed = scipy.sparse.csc_array(scipy.sparse.diags_array(leaving) - c).T
     # The weight of the first node is set to 1, the others follow from their own equations.
-    equations = scipy.sparse.csc_array(scipy.sparse.csr_array(transposed)[1:])
     w = np.ones(size)
-    w[1:] = scipy.sparse.linalg.spsolve(equations[:, 1:], -equations[:, [0]].toarray().reshape(-1))
+    transposed: Any
+    if isinstance(c, FullMatrix):
+        transposed = np.diag(leaving) - c.toarray().T
+        w[1:] = solve_or_nan(transposed[1:, 1:], -transposed[1:, 0])
+    else:
+        transposed = scipy.sparse.csc_array(scipy.sparse.diags_array(leaving) - c).T
+        equations = scipy.sparse.csc_array(scipy.sparse.csr_array(transposed)[1:])
+        right = -equations[:, [0]].toarray().reshape(-1)
+        w[1:] = scipy.sparse.linalg.spsolve(equations[:, 1:], right)
     w = np.maximum(w, 0.0) / np.maximum(w, 0.0).sum()
     if not np.abs(transposed @ w).max() <= RESIDUAL_TOLERANCE * leaving.max():
         raise TheoryError("the messages that arrive do not join all nodes")

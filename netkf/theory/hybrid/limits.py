@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy
 
 from netkf.algorithms.registry import overridden
 from netkf.core.errors import TheoryError
@@ -16,6 +15,7 @@ from netkf.theory.hybrid.coupled import (
     left_weights,
     require_bound,
 )
+from netkf.theory.hybrid.dense import full_matrix, steady_riccati
 from netkf.theory.hybrid.samples import (
     PoissonSamples,
     poisson_samples,
@@ -24,7 +24,7 @@ from netkf.theory.hybrid.samples import (
 )
 from netkf.theory.hybrid.steady import steady_state
 from netkf.theory.intermittent.riccati import filtered_covariance
-from netkf.theory.numerics.matrices import algebraic_riccati, lyapunov
+from netkf.theory.numerics.matrices import lyapunov
 
 
 def limit_covariance(scenario: Scenario) -> FloatArray:
@@ -42,7 +42,7 @@ def limit_covariance(scenario: Scenario) -> FloatArray:
     w = left_weights(scenario)
     G = np.tensordot(w, increment_informations(scenario), 1)
     if not scenario.sampled_sensors:
-        return algebraic_riccati(A, Q, G)
+        return steady_riccati(A, Q, G)
     require_bound(scenario)
     if sample_jumps(scenario):
         raise TheoryError("samples at known times lead to a cycle, not to a limit S")
@@ -78,12 +78,12 @@ def _shared_equation(
     # G (n, n) is the information per second of all increments, each with its node's weight w.
     groups = []
     for group in poisson_samples(scenario):
-        silent = scipy.sparse.csr_array((1, len(group.nodes)))
+        silent = full_matrix(1, len(group.nodes))
         nodes, rate = np.zeros(len(group.nodes), dtype=int), group.rate * w[group.nodes]
         groups.append(PoissonSamples(nodes, group.H, group.R, rate, silent))
     start = np.asarray(scenario.initial_estimate(scenario.nodes[0])[1])[None]
     # No messages, so that nothing is predicted over a delay: T = I, q = 0.
-    eye, none = np.eye(len(A)), scipy.sparse.csr_array((1, 1))
+    eye, none = np.eye(len(A)), full_matrix(1, 1)
     return CoupledRiccati(
         A,
         Q,
@@ -140,7 +140,7 @@ def central_covariance(scenario: Scenario) -> FloatArray:
     for node in scenario.sensing_nodes:
         H, R = scenario.observation_matrices(node)
         G += H.T @ np.linalg.solve(R, H)
-    return algebraic_riccati(scenario.diffusion.A, scenario.diffusion.Q, G)
+    return steady_riccati(scenario.diffusion.A, scenario.diffusion.Q, G)
 
 
 def _central_slot_covariance(scenario: Scenario) -> FloatArray:

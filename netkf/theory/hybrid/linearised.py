@@ -17,6 +17,7 @@ import scipy
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
+from netkf.theory.hybrid.dense import solve_or_nan
 from netkf.theory.hybrid.packed import MAX_PACKED, LinearisedRiccati
 
 MAX_CONDITION = 1e13
@@ -46,6 +47,8 @@ def solve_map(
             )
         if X is not None:
             return X
+        if linear.packed.is_full:
+            return solve_or_nan(linear.full_matrix(), -right.reshape(-1)).reshape(right.shape)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", scipy.sparse.linalg.MatrixRankWarning)
             # A singular map yields nan, which the caller takes as unstable.

@@ -10,12 +10,14 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy
 
 from netkf.linalg.arrays import FloatArray
 from netkf.theory.hybrid.coupled import CoupledRiccati
+from netkf.theory.hybrid.dense import FullMatrix, SparseOrFull
 from netkf.theory.hybrid.samples import PoissonSamples
 
 MAX_PACKED = 16  # states up to which the linear maps of nodes are matrices of packed rows
@@ -50,9 +52,18 @@ class PackedRiccati:
         # P_i leaves at the rate of all arrivals: - sum_j c_ij P_i.
         flows = [equations.coupling, *(s.heard for s in equations.samples)]
         self.leaving = np.asarray(sum(flow.sum(axis=1) for flow in flows)).reshape(-1)
-        leave = scipy.sparse.diags_array(self.leaving)
-        self._exchange = scipy.sparse.csr_array(equations.coupling - leave)
+        self._exchange: Any
+        if self.is_full:
+            self._exchange = equations.coupling.toarray() - np.diag(self.leaving)
+        else:
+            leave = scipy.sparse.diags_array(self.leaving)
+            self._exchange = scipy.sparse.csr_array(equations.coupling - leave)
         self._sensed = np.flatnonzero(np.abs(equations.G).max(axis=(1, 2)) > 0.0)
+
+    @property
+    def is_full(self) -> bool:
+        """True if the coupling is a full matrix, and there are few unknowns."""
+        return isinstance(self.equations.coupling, FullMatrix)
 
     def shift(self, A: FloatArray, Q: FloatArray) -> PackedRiccati:
         """Return the equations with another drift A (n, n) and noise Q, per second."""
@@ -69,15 +80,20 @@ class PackedRiccati:
         self._drift_map = scipy.sparse.csr_array(drift_map) if sparse else drift_map
         self._Q = self.pack(Q)
 
-    def _lyapunov_maps(self) -> scipy.sparse.csr_array:
-        """Return the sparse map (n n, m m) of F to the map of rows by F X + X F'."""
+    def _lyapunov_maps(self) -> Any:
+        """Return the map (n n, m m) of F to the map of rows by F X + X F'."""
         n, m = len(self.equations.A), self.m
         indices, k, row = self._indices.reshape(n, n), np.arange(n), np.arange(m)[:, None]
         # Entry (i, j) of a row of F X + X F' is the sum over k of F_ik X_kj + F_jk X_ik.
         i, j = self._i[:, None], self._j[:, None]
         entries = np.concatenate([i * n + k, j * n + k])
         maps = np.concatenate([indices[k, j] * m + row, indices[k, i] * m + row])
-        arrays = np.ones(entries.size), (entries.reshape(-1), maps.reshape(-1))
+        places = entries.reshape(-1), maps.reshape(-1)
+        if self.is_full and n <= MAX_PACKED // 2:
+            matrix = np.zeros((n * n, m * m))
+            np.add.at(matrix, places, 1.0)
+            return matrix
+        arrays = np.ones(entries.size), places
         return scipy.sparse.csr_array(scipy.sparse.coo_array(arrays, shape=(n * n, m * m)))
 
     def lyapunov_maps(self, F: FloatArray) -> FloatArray:
@@ -96,8 +112,10 @@ class PackedRiccati:
         return len(order) * self.m * (width * self.m) ** 2 <= ELIMINATION_WORK
 
     @cached_property
-    def arriving_matrix(self) -> scipy.sparse.csr_array:
-        """Sparse matrix (N m, N m) of the arrivals at the ticks of link clocks."""
+    def arriving_matrix(self) -> Any:
+        """Sparse or full matrix (N m, N m) of the arrivals at the ticks of link clocks."""
+        if self.is_full:
+            return np.kron(self.equations.coupling.toarray(), self._predicted.T)
         matrix = scipy.sparse.kron(self.equations.coupling, self._predicted.T, "csr")
         return scipy.sparse.csr_array(matrix)
 
@@ -206,7 +224,7 @@ class LinearisedRiccati:
 
     drifts: FloatArray
     own: list[tuple[np.ndarray, FloatArray]]
-    heard: list[tuple[scipy.sparse.csr_array, np.ndarray, FloatArray]]
+    heard: list[tuple[SparseOrFull, np.ndarray, FloatArray]]
     packed: PackedRiccati
 
     @cached_property
@@ -246,6 +264,20 @@ class LinearisedRiccati:
             total += rate.sum() * maps[0] if len(maps) == 1 else np.tensordot(rate, maps, 1)
         return np.asarray(total)
 
+    def full_matrix(self) -> FloatArray:
+        """Return the map as a full matrix (N m, N m), with the arrivals."""
+        size, m = len(self.blocks), self.packed.m
+        operator, nodes = np.zeros((size, m, size, m)), np.arange(size)
+        operator[nodes, :, nodes] = np.swapaxes(self.blocks, 1, 2)
+        for rates, senders, maps in self.heard:
+            if rates is self.packed.equations.coupling:
+                operator += self.packed.arriving_matrix.reshape(operator.shape)
+                continue
+            # Several senders may be the same node, with a map (m, m) for each of its sensors.
+            for rate, sender, one in zip(rates.toarray().T, senders, maps, strict=True):
+                operator[:, :, sender] += rate[:, None, None] * one.T
+        return operator.reshape(size * m, size * m)
+
     def matrix(self, arriving: bool = True) -> scipy.sparse.csc_array:
         """Return the map as a sparse matrix (N m, N m), with the arrivals or block diagonal."""
         size, m = len(self.blocks), self.packed.m
@@ -255,7 +287,7 @@ class LinearisedRiccati:
         operator = scipy.sparse.csr_array(scipy.sparse.bsr_array(bsr_arrays, shape=shape))
         for rates, nodes, maps in self.heard if arriving else ():
             if rates is self.packed.equations.coupling:
-                operator = operator + self.packed.arriving_matrix
+                operator = operator + scipy.sparse.csr_array(self.packed.arriving_matrix)
                 continue
             # Each rate multiplies a map (m, m) of its own, at the block (receiver, sender).
             entries = scipy.sparse.coo_array(rates)

@@ -7,7 +7,7 @@ reading at a known time makes M jump to g(M); docs/poisson_samples.md has the pr
 from __future__ import annotations
 
 import itertools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -23,6 +23,9 @@ from netkf.scenario.model import PlacedSensor
 from netkf.scenario.sampling import sample_path, sample_times
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.observations import Observation, stack_observations
+from netkf.theory.hybrid.dense import FullMatrix, SparseOrFull, full_matrix
+
+MAX_FULL = 100  # nodes up to which weights are a full matrix
 
 
 class PoissonSamples(NamedTuple):
@@ -31,15 +34,15 @@ class PoissonSamples(NamedTuple):
     nodes : (S,) indices of their nodes
     H, R  : (S, p, n), (S, p, p)
     rate  : (S,) samples per second
-    heard : (N, S) sparse: rate (per second) at which messages that the sensor's node sends at its
-            samples arrive at node i, times their weight
+    heard : (N, S), sparse or a FullMatrix: rate (per second) at which messages that the sensor's
+            node sends at its samples arrive at node i, times their weight
     """
 
     nodes: np.ndarray
     H: FloatArray
     R: FloatArray
     rate: FloatArray
-    heard: scipy.sparse.csr_array
+    heard: SparseOrFull
 
     def update_gains(self, P: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the gains K (S, n, p) and ``I - K H`` (S, n, n) of the sensors at P (N, n, n)."""
@@ -57,7 +60,7 @@ class PoissonSamples(NamedTuple):
         """Return the sensors of the node with index ``node`` as those of a network of one node."""
         at_node = self.nodes == node
         count = int(at_node.sum())
-        silent = scipy.sparse.csr_array((1, count))
+        silent = full_matrix(1, count)
         return PoissonSamples(
             np.zeros(count, dtype=int), self.H[at_node], self.R[at_node], self.rate[at_node], silent
         )
@@ -106,14 +109,16 @@ def transmits_at_samples(scenario: Scenario) -> bool:
     return isinstance(clock, LinkClock) and clock.at == "readings"
 
 
-def _mean_link_weights(scenario: Scenario) -> scipy.sparse.csr_array:
-    """Return delivery times weight (receivers, senders), sparse, of messages sent at samples."""
+def _mean_link_weights(scenario: Scenario) -> SparseOrFull:
+    """Return delivery times weight (receivers, senders) of messages sent at samples."""
     index = scenario.topology.index
-    weights = scipy.sparse.lil_array((len(index), len(index)))
+    weights: Any = full_matrix(len(index), len(index))
+    if len(index) > MAX_FULL:
+        weights = scipy.sparse.lil_array(weights.shape)
     if scenario.filter.algorithm.timing.talks and transmits_at_samples(scenario):
         for i, j in scenario.topology.directions:
             weights[index[j], index[i]] = scenario.mean_delivery((i, j)) * scenario.weight(j, i)
-    return scipy.sparse.csr_array(weights)
+    return weights if isinstance(weights, FullMatrix) else scipy.sparse.csr_array(weights)
 
 
 def poisson_samples(scenario: Scenario) -> tuple[PoissonSamples, ...]:
@@ -137,8 +142,10 @@ def poisson_samples(scenario: Scenario) -> tuple[PoissonSamples, ...]:
     for entries in entries_by_rows.values():
         nodes, H, R, rates = (np.array([entry[k] for entry in entries]) for k in range(4))
         senders = [entry[4] for entry in entries]
-        heard = weights[:, senders] * rates
-        groups.append(PoissonSamples(nodes, H, R, rates, scipy.sparse.csr_array(heard)))
+        heard: Any = weights[:, senders] * rates
+        if not isinstance(heard, FullMatrix):
+            heard = scipy.sparse.csr_array(heard)
+        groups.append(PoissonSamples(nodes, H, R, rates, heard))
     return tuple(groups)
 
 

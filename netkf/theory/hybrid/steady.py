@@ -13,6 +13,7 @@ than the time in which H(12) grows, and P exceeds every bound.
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import scipy
@@ -20,8 +21,10 @@ import scipy
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.spectra import growth_rate
+from netkf.network.spectra import connected_parts
 from netkf.scenario.scenario import Scenario
 from netkf.theory.hybrid.coupled import CoupledRiccati, coupled_riccati
+from netkf.theory.hybrid.dense import FullMatrix
 from netkf.theory.hybrid.linearised import is_stable, solve_map
 from netkf.theory.hybrid.packed import PackedRiccati
 from netkf.theory.hybrid.samples import transmits_at_samples
@@ -278,28 +281,35 @@ def _necessary_factor(equations: CoupledRiccati) -> float | None:
         unobserved[group.nodes] = False
     if growth <= 0.0 or not unobserved.any() or any(group.heard.nnz for group in equations.samples):
         return 0.0
-    factored = PackedRiccati(equations).eliminates_cheaply or unobserved.sum() <= MAX_FACTORED
+    few = unobserved.sum() <= MAX_FACTORED
+    factored = few or PackedRiccati(equations).eliminates_cheaply
     leaving = np.asarray(equations.coupling.sum(axis=1)).reshape(-1)[unobserved]
-    inner = scipy.sparse.csc_array(equations.coupling[unobserved][:, unobserved])
+    inner = equations.coupling[unobserved][:, unobserved]
     arriving = inner * float(np.exp(growth * equations.delay))
-    M = scipy.sparse.csc_array(scipy.sparse.diags_array(leaving) - arriving)
+    if isinstance(arriving, FullMatrix):
+        M: Any = np.diag(leaving) - arriving.toarray()
+    else:
+        M = scipy.sparse.csc_array(scipy.sparse.diags_array(leaving) - arriving)
     longest = _longest_lag(M, factored)
     return None if longest is None else growth * longest
 
 
-def _longest_lag(M: scipy.sparse.csc_array, factored: bool) -> float | None:
+def _longest_lag(M: Any, factored: bool) -> float | None:
     """Return a lower bound on the largest eigenvalue of M^-1 (seconds); None unless M-matrix."""
     # By Collatz and Wielandt: for any y > 0 the least y_i / (M y)_i of a part is below it. Steps of
     # the power method make it large, also if they are solved roughly.
     try:
-        factors = scipy.sparse.linalg.splu(M) if factored else None
-    except RuntimeError:  # exactly singular
+        if isinstance(M, np.ndarray):
+            inverse: Any = np.linalg.inv(M).dot
+        else:
+            inverse = scipy.sparse.linalg.splu(M).solve if factored else None
+    except (RuntimeError, np.linalg.LinAlgError):  # exactly singular
         return None
-    _, part = scipy.sparse.csgraph.connected_components(M, directed=False)
+    _, part = connected_parts(M, "weak")
     x, lag, previous = np.ones(M.shape[0]), 0.0, -1.0
     for _ in range(POWER_STEPS):
-        if factors is not None:
-            y = factors.solve(x)
+        if inverse is not None:
+            y = inverse(x)
         else:
             y, _ = scipy.sparse.linalg.bicgstab(M, x, lag * x, rtol=1e-8)
         if not (np.isfinite(y).all() and y.min() > 0.0):
