@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
+import numpy as np
+
 from netkf.core.fields import Component, field, integer, one_of, positive
+from netkf.linalg.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,3 +62,13 @@ class Airtime:
             else:
                 self._end[sender] = self._free[sender] = max(now, free) + self.radio.seconds(size)
         return self._end[sender]
+
+    def waits(self, sender: int, sizes: Iterable[float], times: FloatArray) -> FloatArray:
+        """Return the seconds until the last bits of K transmissions of ``sender`` are sent, one
+        after the other at ``times`` (K,) of so many bytes; nan if dropped.
+        """
+        ends = []
+        for size, now in zip(sizes, times.tolist(), strict=True):
+            self.begin(sender)
+            ends.append(self.end(sender, size, now))
+        return np.asarray(np.array(ends) - times)

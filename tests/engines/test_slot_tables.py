@@ -88,6 +88,11 @@ LIVES = [
     {"kind": "crashes", "mean_up": 2.5, "mean_down": 1.5, "memory": "lost"},
     {"kind": "duty", "period": 2.3, "up": 1.4, "phase": 0.7, "memory": "kept"},
 ]
+RADIOS = [
+    {"bits_per_second": 1600, "queue": "wait"},
+    {"bits_per_second": 1100, "queue": "drop", "frame_bytes": 20},
+    {"frame_bytes": 24},
+]
 STOCHASTIC = {"kind": "event-triggered", "trigger": "stochastic", "Y": 1.0}
 FILTERS = {
     "kcf": {"kind": "kcf", "epsilon": 0.2},
@@ -141,6 +146,8 @@ def drawn(seed, folder):
     network["channel"]["delay"] = one(*DELAYS)
     if one(0, 1):
         network["lives"] = [{**one(*LIVES), "nodes": [1, 3]}]
+    if one(0, 0, 1):
+        network["radio"] = one(*RADIOS)
     return scenario_of(FILTERS[name], folder, seed, network={**network, "activation": activation})
 
 

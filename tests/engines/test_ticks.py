@@ -45,7 +45,7 @@ CLOCKS = {
 def in_python(monkeypatch):
     """Make a schedule whose ticks and outcomes are drawn by the clocks and channels themselves."""
 
-    def make(case, streams, names=("is_kernel_clock", "is_kernel_channel")):
+    def make(case, streams, names=("is_kernel_clock", "draws_in_kernels")):
         with monkeypatch.context() as patch:
             for name in names:
                 patch.setattr(ticks_module, name, lambda part: False)
@@ -150,7 +150,7 @@ def test_room_grows_where_there_are_more_ticks_than_expected(busy, in_python):
     assert_same(all_of(windows)[1], all_of(in_python(case, Streams(3)))[1])
 
 
-@pytest.mark.parametrize("user", [(), ("is_kernel_channel",)])
+@pytest.mark.parametrize("user", [(), ("draws_in_kernels",)])
 def test_several_runs_are_what_each_is_alone(busy, in_python, user):
     case = busy(CHANNELS["shared"])
     few = in_python(case, ReplicaStreams(3, 5, 3), user)

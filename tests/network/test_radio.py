@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 
 import netkf
+from netkf.engines.compiled.engine import CompiledEngine
 from netkf.trace.schema import CODES
 from tests.conftest import SCENARIOS
+from tests.engines.agreement import assert_agree
+from tests.engines.test_batches import assert_alone
 
 SCENARIO = """
 format = 1
@@ -126,3 +129,27 @@ def test_a_filter_that_exchanges_nothing_in_a_slot_has_no_longest_message():
     assert scenario.longest_delay > 0.0
     for kind in ("central", "local"):
         assert scenario.replace({"filter": {"kind": kind}}).longest_delay == 0.0
+
+
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("radio", ["queue = 'wait'", "queue = 'drop'", "frame_bytes = 6"])
+@pytest.mark.parametrize("at", ["nodes", "links", "readings"])
+def test_both_engines_wait_alike(scenario_of, at, radio):
+    """Transmissions of a node wait for each other whichever clock makes them; a node that is down
+    makes none.
+    """
+    changes = {
+        "network.activation": {"kind": "poisson", "rate": 1.5, "at": at},
+        "network.channel.loss": {"kind": "shared", "delivery": 0.8, "share": 0.5},
+        "network.lives": [{"nodes": [0], "kind": "crashes", "mean_up": 5.0, "mean_down": 2.0}],
+        "sensors.0.sampling": {"kind": "poisson", "rate": 2.0},
+    }
+    if at == "readings":
+        changes["network.activation"] = {"kind": "readings"}
+    rate = f"bits_per_second = {128 / AIR}, {radio}"
+    scenario = scenario_of(rate, 20.0).replace({**changes, "probe": 4.0})
+    run = assert_agree(scenario)
+    assert run.count("lost")
+    arrived = run.log[run.log["kind"] == CODES["deliver"]]
+    assert arrived["age"].min() >= AIR - 1e-9
+    assert_alone(scenario, CompiledEngine(), 5, range(2), fingerprint=True)

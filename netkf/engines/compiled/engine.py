@@ -73,9 +73,10 @@ class CompiledEngine(Engine):
             family, part = unknown[0]
             return f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
         network, rule = scenario.network, ""
-        changing = network.radio or network.quantise
-        if changing or scenario.filter.gate is not None:
-            rule = "radios, messages of few bits or a gate"
+        if network.quantise or scenario.filter.gate is not None:
+            rule = "messages of few bits or a gate"
+        elif network.radio and scenario.views is not None:
+            rule = "radios of nodes that estimate different states"
         elif network.lives and scenario.slotted and scenario.views is not None:
             rule = "nodes that are down at times and estimate different states in slots"
         if rule:

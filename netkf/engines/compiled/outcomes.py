@@ -6,8 +6,9 @@ those that the SimPy engine draws message by message.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -43,9 +44,11 @@ from netkf.network.losses import (
     PerLink,
     Transmission,
 )
+from netkf.network.radio import Airtime
 from netkf.rng.draws import Ziggurat, next_exponential, next_unit, ziggurat
 from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
 from netkf.rng.streams import WIDTH, ReplicaStreams, Streams
+from netkf.scenario.model import Network
 from netkf.scenario.scenario import Scenario
 
 LOST, OUT_OF_RANGE = -1.0, -2.0
@@ -181,6 +184,7 @@ def list_outcomes(
         conditions = conditions_of(channel.loss, one, scenario.horizon)
         of_run_ticks = ticks[run * entities : (run + 1) * entities]
         shared = _shared_draws(scenario, one, senders, of_run_ticks)
+        waits = _waits(scenario, senders, of_run_ticks, moving and moving.heard)
         for e in range(entities):
             times = scenario.time_grid.before(scenario.horizon, of_run_ticks[e])
             draws, last = (np.empty(0), np.empty(0), np.empty(0)), -1
@@ -203,40 +207,75 @@ def list_outcomes(
                     conditions=conditions,
                 )  # fmt: skip
                 of_run[w] = np.full(len(times), OUT_OF_RANGE)
-                of_run[w][heard] = message_delays(channel, sent, uniform[heard], delay[heard])
+                delays = message_delays(channel, sent, uniform[heard], delay[heard])
+                if (wait := waits.get((e, first.link[0]))) is not None:
+                    delays = np.where(delays >= 0.0, delays + wait[heard], LOST)
+                of_run[w][heard] = delays
         outcomes += of_run
     return outcomes
+
+
+def _transmissions(
+    scenario: Scenario, senders: Senders, ticks: Sequence[FloatArray]
+) -> Iterator[tuple[int, IntArray, FloatArray]]:
+    """Yield the id of each node, and of its transmissions, in the order of time, (K,) each: by
+    which entity they are made, and when; ``ticks`` in seconds of each entity.
+    """
+    entities_of: dict[int, set[int]] = {}
+    for e in range(len(ticks)):
+        for w in senders.outgoing[senders.first[e] : senders.first[e + 1]].tolist():
+            entities_of.setdefault(senders.directions[w][0], set()).add(e)
+    for node, entities in entities_of.items():
+        times = [scenario.time_grid.before(scenario.horizon, ticks[e]) for e in sorted(entities)]
+        owner = np.repeat(sorted(entities), [len(of_one) for of_one in times])
+        # By (time, entity).
+        order = np.lexsort((owner, np.concatenate(times)))
+        yield node, owner[order], np.concatenate(times)[order]
 
 
 def _shared_draws(
     scenario: Scenario, streams: Streams, senders: Senders, ticks: Sequence[FloatArray]
 ) -> dict[tuple[int, int], BroadcastDraw]:
     """Return what the hearers share of each tick of entity e at which a node sends, by (e, id of
-    the node), if they share anything; ``ticks`` in seconds of each entity.
+    the node), if they share anything.
     """
-    broadcasts = broadcasts_of(scenario, streams)
+    broadcasts, shared = broadcasts_of(scenario, streams), {}
     if broadcasts is None:
         return {}
-    entities_of: dict[int, set[int]] = {}
-    for e in range(len(ticks)):
-        for w in senders.outgoing[senders.first[e] : senders.first[e + 1]].tolist():
-            entities_of.setdefault(senders.directions[w][0], set()).add(e)
-    shared = {}
-    for node, entities in entities_of.items():
-        times = [scenario.time_grid.before(scenario.horizon, ticks[e]) for e in sorted(entities)]
-        owner = np.repeat(sorted(entities), [len(of_one) for of_one in times])
-        # The transmissions of a node, in the order of time: by (time, entity).
-        order = np.lexsort((owner, np.concatenate(times)))
-        drawn = broadcasts.draws(node, len(owner))
-        uniform, bad = np.empty(len(owner)), None
-        uniform[order] = drawn.uniform
-        if drawn.bad is not None:
-            bad = np.empty(len(owner), dtype=bool)
-            bad[order] = drawn.bad
-        for e in entities:
-            chosen = owner == e
-            shared[e, node] = BroadcastDraw(uniform[chosen], None if bad is None else bad[chosen])
+    for node, owner, times in _transmissions(scenario, senders, ticks):
+        drawn = broadcasts.draws(node, len(times))
+        for e in np.unique(owner).tolist():
+            own = owner == e
+            bad = None if drawn.bad is None else drawn.bad[own]
+            shared[e, node] = BroadcastDraw(drawn.uniform[own], bad)
     return shared
+
+
+def _waits(
+    scenario: Scenario,
+    senders: Senders,
+    ticks: Sequence[FloatArray],
+    heard: Sequence[np.ndarray] | None,
+) -> dict[tuple[int, int], FloatArray]:
+    """Return the seconds until a node has sent the last bit of its message at each tick of entity
+    e, nan if it is dropped, by (e, id of the node), where radios take time. ``heard``: whether
+    anything is sent on a direction, if nodes move or are down.
+    """
+    found: dict[tuple[int, int], FloatArray] = {}
+    if not scenario.messages_queue or scenario.network.radio is None:
+        return found
+    airtime = Airtime(scenario.network.radio)
+    for node, owner, times in _transmissions(scenario, senders, ticks):
+        speaks = np.full(len(times), heard is None)
+        for e in np.unique(owner).tolist():
+            for w in senders.outgoing[senders.first[e] : senders.first[e + 1]].tolist():
+                if heard is not None and senders.directions[w][0] == node:
+                    speaks[owner == e] |= heard[w]
+        waits = np.zeros(len(times))
+        sizes = itertools.repeat(scenario.message_size(node, -1), int(speaks.sum()))
+        waits[speaks] = airtime.waits(node, sizes, times[speaks])
+        found |= {(e, node): waits[owner == e] for e in np.unique(owner).tolist()}
+    return found
 
 
 def _sampler(channel: Channel, streams: Streams, ends: Link) -> ChannelSampler:
@@ -261,9 +300,12 @@ def message_delays(
     return np.where(lost, LOST, delay)
 
 
-def is_kernel_channel(channel: Channel) -> bool:
-    """Return True if kernels can draw the outcomes of a channel."""
+def draws_in_kernels(network: Network) -> bool:
+    """Return True if kernels can draw the outcomes of messages."""
     # By exact type: a subclass may override the law.
+    channel = network.channel
+    if network.radio is not None:
+        return False
     has_known_law = type(channel.loss) in LOSSES and type(channel.delay) in DELAYS
     return has_known_law and draws_per_link(channel)
 

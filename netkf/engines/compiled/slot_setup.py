@@ -358,6 +358,7 @@ class SlotSetup:
         self.channel, loss = channel, channel.loss
         # The probabilities of a user's own loss model are computed in Python, message by message.
         has_known_law = identical_per_link(loss) or type(loss) is GilbertElliott
+        has_known_law &= scenario.network.radio is None
         self.has_known_probabilities = has_known_law and draws_per_link(channel)
         self.delivery = np.ones((2, len(self.directions)))
         if self.has_known_probabilities:

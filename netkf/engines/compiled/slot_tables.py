@@ -41,6 +41,7 @@ from netkf.network.delays import delay_depends_on_message
 from netkf.network.graphs import Link
 from netkf.network.losses import GilbertElliott, Transmission, identical_per_link
 from netkf.network.matchings import Broadcast, Matching, used_links
+from netkf.network.radio import Airtime
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN
@@ -193,6 +194,8 @@ class SlotTables:
         self._first, self._delivery = _first_messages(scenario)
         if conditions is not None:
             self._first = [sent._replace(conditions=conditions) for sent in self._first]
+        self._radio = scenario.network.radio
+        self._airtime = None if self._radio is None else Airtime(self._radio)
         self._follows = self._reach is not None and channel.loss.follows_distance
         senders = setup.senders
         samplers = [
@@ -410,7 +413,7 @@ class SlotTables:
         w = uses.w
         number = numbers_of(w, np.ones(len(w), dtype=bool), self._sent_so_far)
         begin, closes = times.begin[uses.slot, uses.step], times.end[uses.slot, uses.step]
-        delay = self._grid.snap(self._delays(uses, number, begin))
+        delay = self._grid.snap(self._delays(uses, number, begin) + self._waits(uses, begin))
         arrival, receiver = self._grid.snap(begin + delay), self._receiver[w]
         lost, absorbed = np.zeros(len(w), dtype=bool), arrival <= closes
         if self._scenario.network.lives:
@@ -428,17 +431,39 @@ class SlotTables:
         if self._delivery is not None:
             arrives = uniform < self._delivery[(bad == 1.0).astype(np.int64), uses.w]
             return np.where(arrives & uses.up, drawn, NAN)
-        delays = np.full(len(number), NAN)
-        order = np.argsort(uses.w, kind="stable")
-        cuts = np.searchsorted(uses.w[order], np.arange(len(self._first) + 1))
-        for w in np.flatnonzero(np.diff(cuts)).tolist():
-            one = order[cuts[w] : cuts[w + 1]]
+        delays, phase = np.full(len(number), NAN), self._phase[uses.step]
+        # Messages of another phase may have another size.
+        phases = 1 + int(phase.max(initial=0)) if self._radio is not None else 1
+        key = uses.w * phases + (phase if phases > 1 else 0)
+        order = np.argsort(key, kind="stable")
+        cuts = np.searchsorted(key[order], np.arange(len(self._first) * phases + 1))
+        for k in np.flatnonzero(np.diff(cuts)).tolist():
+            w, of_phase = divmod(k, phases)
+            one = order[cuts[k] : cuts[k + 1]]
             one = one[uses.up[one]]
             sent = self._first[w]._replace(number=number[one], time=begin[one], bad=bad[one] == 1.0)
             if self._follows:
                 sent = sent._replace(distance=uses.distance[one])
+            if of_phase and self._radio is not None:
+                size = self._scenario.message_size(sent.link[0], of_phase)
+                sent = sent._replace(size=size, frames=self._radio.frames(size))
             delays[one] = message_delays(self._channel, sent, uniform[one], drawn[one])
         return np.where(delays >= 0.0, delays, NAN)
+
+    def _waits(self, uses: Uses, begin: FloatArray) -> Any:
+        """Return the seconds (K,) until radios have sent the last bit, nan if it is dropped."""
+        if self._airtime is None:
+            return 0.0
+        sender = self._sender[uses.w]
+        key = (uses.slot * len(self._setup.fresh) + uses.step) * len(self._ids) + sender
+        # One transmission for all hearers.
+        _, first, back = np.unique(key, return_index=True, return_inverse=True)
+        waits, of_sender, phase = np.zeros(len(first)), sender[first], self._phase[uses.step[first]]
+        for h in np.unique(of_sender).tolist():
+            own, node = of_sender == h, int(self._ids[h])
+            sizes = [self._scenario.message_size(node, k) for k in phase[own].tolist()]
+            waits[own] = self._airtime.waits(node, sizes, begin[first[own]])
+        return waits[back]
 
     def _count(
         self, starts: list[Rows], messages: Messages, recorded: np.ndarray, steps: int
@@ -630,6 +655,7 @@ def _first_messages(scenario: Scenario) -> tuple[list[Transmission], FloatArray 
     first = [scenario.transmission(ends) for ends in directions]
     one_law = identical_per_link(channel.loss) or type(channel.loss) is GilbertElliott
     moves = scenario.links_move and channel.loss.follows_distance
+    one_law &= scenario.network.radio is None
     if not one_law or moves or channel.channels or delay_depends_on_message(channel.delay):
         return first, None
     return first, delivery_table(scenario, channel.loss, directions)

@@ -23,7 +23,7 @@ from netkf.engines.compiled.outcomes import (
     channel_streams,
     delivery_table,
     draw_outcomes,
-    is_kernel_channel,
+    draws_in_kernels,
     list_outcomes,
 )
 from netkf.engines.compiled.per_scenario import once_per_scenario
@@ -344,7 +344,7 @@ def _is_listed(scenario: Scenario) -> bool:
     return (
         scenario.links_move
         or bool(network.clocks)
-        or not (is_kernel_clock(network.activation) and is_kernel_channel(network.channel))
+        or not (is_kernel_clock(network.activation) and draws_in_kernels(network))
     )
 
 
@@ -513,7 +513,7 @@ class Schedule:
         if scenario.links_move and listed is not None:
             self._moving = moving_links(scenario, senders, listed, truth, lives.is_down)
         delivery, outcomes = np.ones((2, len(senders.directions))), []
-        if senders.entities and is_kernel_channel(channel) and self._moving is None:
+        if senders.entities and draws_in_kernels(scenario.network) and self._moving is None:
             delivery = _delivery(scenario)
         elif senders.entities and listed is not None:
             heard = self._moving
