@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 import scipy
 
+from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Topology
 
 MAX_KAMADA_KAWAI, PIVOTS = 150, 50
 """Nodes up to which the layout of Kamada and Kawai is computed, from distances between all pairs of
 nodes; for larger networks only distances to so many pivots are.
 """
+MAX_STEPS = 300  # of a search for positions
 MAX_RING = 30
 """Nodes of a ring up to which it is drawn as a circle."""
 Positions = dict[int, tuple[float, float]]
@@ -42,13 +44,54 @@ def compute_layout(topology: Topology) -> Positions:
         angles = 2.0 * np.pi * np.arange(len(nodes)) / len(nodes)
         circle = zip(nodes, np.cos(angles).tolist(), np.sin(angles).tolist(), strict=True)
         return {node: (x, y) for node, x, y in circle}
-    import networkx
+    X = _spring_layout(_hops(topology))
+    return {node: (float(x), float(y)) for node, (x, y) in zip(nodes, X, strict=True)}
 
-    graph: networkx.Graph[int] = networkx.Graph()
-    graph.add_nodes_from(nodes)
-    graph.add_edges_from(topology.links)
-    points: dict[int, Any] = networkx.kamada_kawai_layout(graph)
-    return {node: (float(x), float(y)) for node, (x, y) in points.items()}
+
+def _hops(topology: Topology) -> FloatArray:
+    """Return the distances (N, N) in links; nodes without a path are beyond all others."""
+    size = len(topology.nodes)
+    links = np.eye(size, dtype=np.float32)
+    for i, j in topology.links:
+        a, b = topology.index[i], topology.index[j]
+        links[a, b] = links[b, a] = 1.0
+    distances, reached = np.zeros((size, size)), np.eye(size, dtype=bool)
+    for _ in range(size):
+        distances[~reached] += 1.0
+        reached = reached.astype(np.float32) @ links > 0.0
+    distances[~reached] = 1.5 * max(float(distances[reached].max()), 1.0)
+    return distances
+
+
+def _spring_layout(distances: FloatArray) -> FloatArray:
+    """Return positions (N, 2) of low stress, the sum of ``(|x_i - x_j| / d_ij - 1)^2``: searched
+    for from a circle and, where that ends at a much higher one, from classical scaling.
+    """
+    size = len(distances)
+    angles, centre = 2.0 * np.pi * np.arange(size) / size, np.eye(size) - 1.0 / size
+    circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    values, vectors = np.linalg.eigh(-0.5 * centre @ distances**2 @ centre)
+    scaled = vectors[:, -2:] * np.sqrt(np.maximum(values[-2:], 0.0))
+    (stress, X), (other, Y) = (_lower_stress(start, distances) for start in (circle, scaled))
+    # Complete graphs and rings look best as circles.
+    X = Y if other < 0.9 * stress else X
+    return np.asarray(X / np.abs(X).max())
+
+
+def _lower_stress(X: FloatArray, distances: FloatArray) -> tuple[float, FloatArray]:
+    """Return the stress and positions (N, 2) after steps that lower the stress of X."""
+    # The energy of Kamada and Kawai (1989) by majorisation (Gansner, Koren and North 2004).
+    size, stress = len(X), np.inf
+    weights = (distances + np.eye(size)) ** -2.0 - np.eye(size)
+    inverse = np.linalg.inv(np.diag(weights.sum(axis=1)) - weights + 1.0 / size)
+    for _ in range(MAX_STEPS):
+        lengths = np.sqrt(((X[:, None] - X) ** 2).sum(axis=2))
+        previous, stress = stress, float((weights * (lengths - distances) ** 2).sum())
+        if stress <= 1e-4 or previous - stress <= 1e-6 * stress:
+            break
+        pull = weights * distances / np.maximum(lengths, 1e-9)
+        X = inverse @ (pull.sum(axis=1)[:, None] * X - pull @ X)
+    return stress, X
 
 
 def _pivot_layout(topology: Topology) -> Positions:
