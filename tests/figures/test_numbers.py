@@ -9,6 +9,7 @@ import scipy.stats
 import netkf
 from netkf.algorithms.models import FlowModel
 from netkf.checks.innovations import ExpectedIncrements, autocorrelation, compute_innovations
+from netkf.figures.panels import MAX_FREEDOM, nees_interval
 from netkf.figures.traffic import age_of_information, messages_by_direction, wilson_interval
 from netkf.studies.consistency import run_consistency
 from netkf.trace.messages import join_messages
@@ -140,3 +141,10 @@ def test_white_noise_is_found_white_and_coloured_noise_is_not():
     assert np.abs(found).max() < 4.0 / np.sqrt(4000)
     moving = white[1:] + 0.8 * white[:-1]
     assert autocorrelation(moving, 3)[0] == pytest.approx(0.8 / 1.64, abs=0.05)
+
+
+@pytest.mark.parametrize("runs", [1, 5, MAX_FREEDOM])
+def test_the_interval_of_nees_is_that_of_chi_square(runs):
+    for n in (1, 2, 3, 8, 20):
+        expected = scipy.stats.chi2.ppf([0.025, 0.975], runs * n) / runs
+        np.testing.assert_allclose(nees_interval(n, runs), expected, rtol=1e-12)
