@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.kernels.gains import stack_gains
+from netkf.algorithms.kernels.gates import no_gate
 from netkf.algorithms.kernels.maps import SingleMapRun
 from netkf.algorithms.kernels.nonlinear_rows import no_nonlinear
 from netkf.algorithms.kernels.pairs import no_pairs
@@ -210,6 +211,7 @@ class Surroundings:
             common=ALIKE,
             pairs=no_pairs() if self._pairs is None else self._pairs.none(),
             nonlinear=no_nonlinear(),
+            gate=no_gate(),
             reading=OWN,
             first_y=0,
             first_H=0,

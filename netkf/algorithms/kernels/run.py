@@ -86,6 +86,7 @@ class SlotRun(Struct):
              sender's it is, -1: none; (0, 0) where messages need no translation
     pairs : those of readings that are also about blocks which their node does not estimate
     nonlinear : NonlinearRows of the readings, where they are not linear
+    gate : GateTables, where readings pass a gate
     offset : (n, L), by which ``shift`` moves estimates
     gap, slot, phase, step : seconds of a prediction, numbers of slot, exchange and repetition
     now : under clocks the end of the prediction, or the time to which messages are predicted
@@ -123,6 +124,7 @@ class SlotRun(Struct):
     common: IntArray
     pairs: Any
     nonlinear: Any
+    gate: Any
     reading: int
     first_y: int
     first_H: int

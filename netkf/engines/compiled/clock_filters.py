@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from netkf.algorithms.kernels.gates import GateTables, gate_tables, no_gate
 from netkf.algorithms.kernels.nonlinear_rows import linear_rows, no_nonlinear
 from netkf.algorithms.kernels.pairs import no_pairs, pairs_of
 from netkf.algorithms.kernels.rates import RateRun
@@ -54,6 +55,7 @@ class ClockFilters:
         self._p = self._samples = 1
         columns = BlockColumns(scenario, entries_of(scenario))
         self._columns, self._n = (columns.width, columns.entries.shape[1]), scenario.plant.n
+        self._gate = scenario.filter.gate
         self._readings = None
         if not (linear := all(sensor.linear for sensor in scenario.sensors)):
             self._readings = nonlinear_sensors(scenario)
@@ -193,6 +195,7 @@ class ClockFilters:
             pairs = pairs_of(rows, own, np.zeros(1 + readings, dtype=np.int64))
         return {
             "pairs": pairs,
+            "gate": self._gate_of_instants(),
             "y": np.zeros((readings, self._p, 1)),
             "H": np.zeros((readings, self._p, columns, 1)),
             "rows": np.zeros(readings, dtype=np.int64),
@@ -204,6 +207,13 @@ class ClockFilters:
             "heard": np.full(messages, -1),
             "arrived": np.ones((messages, 1), dtype=np.uint8),
         }
+
+    def _gate_of_instants(self) -> GateTables:
+        """Return the gate with room for all samples of an instant, which the loop writes."""
+        if self._gate is None:
+            return no_gate()
+        parts = [(0, self._p)] * self._samples
+        return gate_tables(self._gate, self._columns[1], (1, 1), [parts])
 
     def advance(self, state: Simulation) -> int:
         """Run the event loop until it needs something from Python; return its request."""

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from netkf.algorithms.kernels import run as standard
+from netkf.algorithms.kernels.gates import pass_gate, scale_rows
 from netkf.algorithms.kernels.rates import RateTables
 from netkf.algorithms.kernels.run import ClockRun, interval_end
 from netkf.algorithms.records import Kernels
@@ -31,6 +32,7 @@ from netkf.engines.compiled.events import (
     ON_SAMPLE,
     ON_SENSE,
     ON_TICK,
+    REFUSE,
     SEND,
     SENSE,
     SOME_ARRIVE,
@@ -90,6 +92,7 @@ class ClockVerbs(Struct):
     restart : copies all arrays of a record that is given in place of a run
     translate : makes of a message of another node what the receiver reads in it
     linearise : makes linear readings of the samples of an instant that are not
+    gate : lets a reading pass the gate, where there is one
     whole_gaps : whether a prediction over a gap is not that over its parts
     models : (N, words), the struct of each node's model, (0, 0) if that of the run is all's
     kept, room : of a filter that remembers, see ``records.Record``
@@ -105,6 +108,7 @@ class ClockVerbs(Struct):
     restart: int
     translate: int
     linearise: int
+    gate: int
     whole_gaps: int
     decides: int
     sends_readings: int
@@ -154,6 +158,7 @@ def clock_verbs(
         restart=address_of(restart, record, record),
         translate=address_of(standard.read_common, record, run, 2) if len(run.common) else NOTHING,
         linearise=NOTHING if linear else address_of(linearise_instant, record, no_table(), 2),
+        gate=address_of(pass_gate, record, run, 2) if run.gate.active else NOTHING,
         whole_gaps=isinstance(run.model, RateTables),
         **{name: getattr(kernels, name) for name in FLAGS},
         room=record.room if kernels.remembers else 0,
@@ -291,10 +296,37 @@ def on_sample(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, 
         call_at_two(verbs.linearise, record, h, instant, instants.nonlinear)
     whiten_instant(state, run, OWN, instant)
     run.reading = OWN
+    if verbs.gate != NOTHING:
+        pass_instant(state, record, run, verbs, h, now)
     choose_model(state, run, verbs, h)
     call_at(verbs.update, record, h, run)
     state.nodes[h].reading = instant
     state.instant_at += 1
+
+
+@kernel
+def pass_instant(
+    state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, h: int, now: float
+) -> None:
+    """Let the samples of the next instant, ``now`` (seconds), pass the gate of node ``h``."""
+    instants, gate, instant, row, count = state.instants, run.gate, state.instant_at, 0, 0
+    for s in range(instants.first[instant], instants.first[instant + 1]):
+        if instants.block[s] == -1:
+            gate.row[count], gate.length[count] = row, instants.rows[instants.sensor[s]]
+            row, count = row + gate.length[count], count + 1
+    gate.first[1] = count
+    call_at_two(verbs.gate, record, h, 0, run)
+    count, refused = 0, False
+    for s in range(instants.first[instant], instants.first[instant + 1]):
+        if instants.block[s] == -1:
+            instants.scale[s] = gate.scale[count, 0]
+            if instants.scale[s] != 1.0:
+                refused = True
+                record_event(state, now, REFUSE, state.nodes[h].id, -1, -1)
+            count += 1
+    if refused:
+        # Without the samples that are ignored.
+        whiten_instant(state, run, OWN, instant)
 
 
 @kernel
@@ -438,8 +470,12 @@ def whiten_instant(state: Simulation, run: ClockRun, r: int, instant: int) -> No
     instants, row = state.instants, 0
     for s in range(instants.first[instant], instants.first[instant + 1]):
         # Readings of pairs are for others.
-        if instants.block[s] == -1:
+        gated = len(instants.scale) > 0
+        if instants.block[s] == -1 and not (gated and instants.scale[s] == 0.0):
             whiten_sample(instants, run, r, s, row, len(run.size))
+            if gated and instants.scale[s] != 1.0:
+                place = r, row, instants.rows[instants.sensor[s]]
+                scale_rows(run, place, 0, instants.scale[s])
             row += instants.rows[instants.sensor[s]]
     run.rows[r] = row
 

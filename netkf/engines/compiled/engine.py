@@ -44,6 +44,19 @@ PLANTS = (
 )
 
 
+def gate_refusal(scenario: Scenario) -> str | None:
+    """Return which readings a gate of this scenario looks at that kernels do not; None if none."""
+    algorithm, kernels = scenario.node_filter, scenario.node_filter.kernels
+    if algorithm.timing.talks and kernels is not None and kernels.sends_readings:
+        return "readings that messages bring"
+    if not all(sensor.linear for sensor in scenario.sensors):
+        if scenario.views is not None:
+            return "nonlinear readings of nodes that estimate different states"
+        if scenario.filter.linearise != "ekf":
+            return "nonlinear readings at sigma points"
+    return None
+
+
 @dataclass(frozen=True)
 class CompiledEngine(Engine):
     """Runs all built-in plants, linear sensors and filters. Clocks, losses, delays and sensors that
@@ -73,8 +86,8 @@ class CompiledEngine(Engine):
             family, part = unknown[0]
             return f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
         network, rule = scenario.network, ""
-        if network.quantise or scenario.filter.gate is not None:
-            rule = "messages of few bits or a gate"
+        if network.quantise:
+            rule = "messages of few bits"
         elif network.radio and scenario.views is not None:
             rule = "radios of nodes that estimate different states"
         elif network.lives and scenario.slotted and scenario.views is not None:
@@ -87,6 +100,8 @@ class CompiledEngine(Engine):
                 f'engine "compiled" has no code for the filter {name!r}, whose methods are plain '
                 f"Python; {remedy}, or write them as kernels (netkf.kernels)"
             )
+        if scenario.filter.gate is not None and (rule := gate_refusal(scenario)) is not None:
+            return f'engine "compiled" cannot run a gate on {rule}; {remedy}'
         return None
 
     def announce(self, scenario: Scenario) -> None:

@@ -21,9 +21,12 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.trace.schema import CODES
 
-SENSE, TICK, SEND, DELIVER, LOST, LATE, ABSORB, TRANSMIT, LINK = (
+SENSE, REFUSE, TICK, SEND, DELIVER, LOST, LATE, ABSORB, TRANSMIT, LINK = (
     CODES[kind]
-    for kind in ("sense", "tick", "send", "deliver", "lost", "late", "absorb", "transmit", "link")
+    for kind in (
+        *("sense", "refuse", "tick", "send", "deliver", "lost", "late", "absorb", "transmit"),
+        "link",
+    )
 )
 (GO_ON, WANT_TICKS, WANT_STEPS, WANT_MESSAGES, WANT_ROWS, WANT_SAMPLES, WANT_REBASE, WANT_LIFE,
  WANT_PAST, DONE) = range(10)  # fmt: skip

@@ -265,6 +265,7 @@ class Workspace:
     def _scalar_fields(self, instants: Instants) -> dict[str, Any]:
         algorithm = self._scenario.node_filter
         max_messages = int(np.diff(self._senders.first).max(initial=0))
+        of_instant = 1 if self._scenario.filter.gate is None else 2
         return {
             "clock_kind": CLOCKS.index(self._senders.at),
             "newest_only": algorithm.timing.newest_only,
@@ -272,10 +273,10 @@ class Workspace:
             "free_count": len(self._pool[0]),
             # Each message of a tick leaves a "send", its outcome and perhaps an "absorb", and the
             # tick or transmission two rows more; an instant of samples leaves one row per sensing
-            # node.
+            # node, and a gate one per sample.
             "most_rows": 2
             + 3 * max_messages
-            + int(np.diff(instants.first).max(initial=0))
+            + of_instant * int(np.diff(instants.first).max(initial=0))
             # Links that come up or go down.
             + len(self._scenario.topology.links) * self._scenario.links_move,
             "horizon": self._scenario.horizon,

@@ -404,5 +404,6 @@ def _make_instants(
         rows=tables.rows,
         root=tables.root,
         H=H,
+        scale=np.ones(0 if scenario.filter.gate is None else len(t)),
         nonlinear=nonlinear_table(scenario, sensor, t, read),
     )

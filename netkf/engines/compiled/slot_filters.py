@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from netkf.algorithms.kernels.gates import gate_tables, no_gate
 from netkf.algorithms.kernels.maps import MapRun
 from netkf.algorithms.kernels.nonlinear_rows import no_nonlinear
 from netkf.algorithms.kernels.pairs import Pairs, no_pairs
@@ -70,7 +71,7 @@ class SlotFilters:
             lanes=LANES,
         )
         self._models = self._models_of(active)
-        self._run = self._run_of(no_pairs() if pairs is None else pairs)
+        self._run = self._run_of(no_pairs() if pairs is None else pairs, active)
         words = len(self._models[0].memory)
         memories = [model.memory for model in self._models] if setup.own_models else []
         # None where the model of the run is that of all filters.
@@ -103,9 +104,11 @@ class SlotFilters:
         models = setup.models[: len(setup.tables[0])]
         return [m.tables(LANES, active, delay, setup.width) for m in models]
 
-    def _run_of(self, pairs: Pairs) -> Any:
+    def _run_of(self, pairs: Pairs, active: int) -> Any:
         """Return what surrounds the nodes, before any slot."""
-        setup, n = self._setup, self._setup.width
+        setup, n, gate = self._setup, self._setup.width, no_gate()
+        if setup.gate is not None:
+            gate = gate_tables(setup.gate, n, (LANES, active), setup.gated_parts)
         size = size_of(n, self.kernels.unrolled)
         cls: Any = MapRun if isinstance(setup.models[0], MapModel) else SlotRun
         cls = cls.of_size(n) if isinstance(size, tuple) else cls
@@ -134,6 +137,7 @@ class SlotFilters:
             common=setup.common,
             pairs=pairs,
             nonlinear=no_nonlinear(),
+            gate=gate,
             reading=0,
             first_y=0,
             first_H=0,

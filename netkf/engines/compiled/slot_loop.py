@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from netkf.algorithms.kernels import run as standard
+from netkf.algorithms.kernels.gates import pass_gate
 from netkf.algorithms.kernels.nonlinear_rows import linearise_rows
 from netkf.algorithms.kernels.run import SlotRun
 from netkf.algorithms.records import Kernels
@@ -51,6 +52,7 @@ class SlotPlan(Struct):
     sent : (B, S, E, H, L), 1 if a node is asked for a message, and where kernels decide 0 where it
         sends nothing; empty if all nodes are asked, and send
     uniform : (B, S, E, H, L), uniform numbers for these decisions; empty unless randomised
+    refused : (B, S, G, L), 1 where a gate refuses a part of a reading; empty without one
     varies : whether H differs from block to block and slot to slot
     models : (H, words), the struct of each filter's model, (0, words) if ``run.model`` is all's
     start, end : the slots that a call simulates, of those of the plan
@@ -71,6 +73,7 @@ class SlotPlan(Struct):
     direction: IntArray
     sent: np.ndarray
     uniform: FloatArray
+    refused: np.ndarray
     varies: int
     models: IntArray
     begin: int
@@ -114,6 +117,7 @@ class SlotVerbs(Struct):
     """Addresses of a filter's verbs, and what ``records.Kernels`` says of them as 0 or 1.
 
     linearise : of ``linearise_rows``, where readings are not linear
+    gate : of ``pass_gate``, where there is one
     translate : of ``read_common``
     """
 
@@ -124,6 +128,7 @@ class SlotVerbs(Struct):
     observe: int
     shift: int
     linearise: int
+    gate: int
     translate: int
     decides: int
     addressed: int
@@ -154,6 +159,7 @@ def slot_verbs(kernels: Kernels, record: Any, run: Any, talks: bool, linear: boo
         observe=address_of(kernels.observe, record, run) if observes else NOTHING,
         shift=NOTHING,
         linearise=NOTHING if linear else address_of(linearise_rows, record, any_slot_run(run), 2),
+        gate=address_of(pass_gate, record, any_slot_run(run), 2) if run.gate.active else NOTHING,
         translate=address_of(standard.read_common, record, run, 2) if len(run.common) else NOTHING,
         decides=kernels.decides,
         addressed=kernels.addressed,
@@ -208,7 +214,19 @@ def simulate_slot(
                     run.reading = h
                     if verbs.linearise != NOTHING:
                         call_at_two(verbs.linearise, record, h, s, run)
+                    if verbs.gate != NOTHING:
+                        call_at_two(verbs.gate, record, h, h, run)
+                        note_refusals(run, plan, b, s, h)
                     call_at(verbs.update, record, h, run)
+
+
+@kernel
+def note_refusals(run: AnySlotRun, plan: SlotPlan, b: int, s: int, h: int) -> None:
+    """Set ``plan.refused`` where the gate of filter ``h`` has refused a part of its reading."""
+    gate = run.gate
+    for g in range(gate.first[h], gate.first[h + 1]):
+        for q in range(gate.active):
+            plan.refused[b, s, g, q] = gate.scale[g, q] != 1.0
 
 
 @kernel

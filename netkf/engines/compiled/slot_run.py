@@ -25,6 +25,7 @@ from netkf.engines.compiled.outcomes import channel_streams
 from netkf.engines.compiled.own_sensors import read_whitened
 from netkf.engines.compiled.samples import by_node, record_samples
 from netkf.engines.compiled.slot_filters import SlotFilters
+from netkf.engines.compiled.slot_gates import REFUSE, count_refusals, with_refusals
 from netkf.engines.compiled.slot_loop import WHOLE, SlotSamples
 from netkf.engines.compiled.slot_messages import (
     ABSORB,
@@ -94,13 +95,15 @@ class SampledStates(NamedTuple):
 
 class SlotBlock(NamedTuple):
     """Results of S slots of R runs: indices ``sampled`` (T,) of the slots with a sample, the
-    ``samples`` of these slots or of all slots so far, the times of the slots, and their messages.
+    ``samples`` of these slots or of all slots so far, the times of the slots, their messages, and
+    ``SlotPlan.refused``.
     """
 
     sampled: np.ndarray
     samples: SampledStates
     times: SlotTimes
     messages: SlotMessages
+    refused: np.ndarray
 
 
 class SlotRuns:
@@ -247,12 +250,12 @@ class SlotRuns:
             entries=np.maximum(self.setup.entries, 0) if self.setup.views is not None else _ALL,
         )  # fmt: skip
         slots = times.first + sampled
-        self._simulate(times, messages, (y, H, rebased), kernel_samples)
+        refused = self._simulate(times, messages, (y, H, rebased), kernel_samples)
         if not drawn and responses is not None and responses.believed is not None:
             # Recorded states may be unknown, where coordinates begin is not.
             moved = responses.believed.states(slots)[:, self.setup.entries]
             samples.xhat[:, times.sample[sampled]] += moved
-        return SlotBlock(sampled, samples, times, messages)
+        return SlotBlock(sampled, samples, times, messages, refused)
 
     def _simulate(
         self,
@@ -260,8 +263,9 @@ class SlotRuns:
         messages: SlotMessages,
         readings: tuple[FloatArray, FloatArray, np.ndarray],
         samples: SlotSamples,
-    ) -> None:
+    ) -> np.ndarray:
         filters, count, (y, H, rebased) = self._filters, len(times.start), readings
+        gated = len(self.setup.assigned) if self.setup.gate is not None else 0
         drawn: dict[str, Any] = {
             "first": self._slot,
             "sensed": times.sensed,
@@ -271,6 +275,7 @@ class SlotRuns:
             "up": messages.up,
             "sent": messages.sent,
             "uniform": self._draw_uniforms(messages.sent),
+            "refused": np.zeros((self._blocks, count, gated, LANES), dtype=np.uint8),
         }
         unread, begin = self._missed_readings(messages, count), WHOLE
         # Nodes begin again before the first slot of a block.
@@ -295,6 +300,8 @@ class SlotRuns:
         if self.setup.pairs is not None:
             self.setup.pairs.nonlinear.raise_error()
         self._slot += count
+        refused: np.ndarray = drawn["refused"]
+        return refused
 
     def _moved(self, h: int) -> FloatArray:
         """Return by how much the prior of a filter differs in the coordinates of this slot."""
@@ -695,11 +702,13 @@ class SlotRuns:
         """Return the EVENT rows (K,) of a block of one run, and the number of rows before each of
         its samples, (T,).
         """
-        # Tables know the events, but not in which slot nodes stopped.
         if self._tables:
-            return self._tables[0].events(block.sampled, self._stopped[0, :, 0])
-        before_sample = np.zeros(len(block.sampled), dtype=np.int64)
-        return self._rows(block, 0, len(block.times.start), before_sample), before_sample
+            # Tables know the events, but not in which slot nodes stopped, and what gates refused.
+            rows, before_sample = self._tables[0].events(block.sampled, self._stopped[0, :, 0])
+        else:
+            before_sample = np.zeros(len(block.sampled), dtype=np.int64)
+            rows = self._rows(block, 0, len(block.times.start), before_sample)
+        return with_refusals(self.setup, block.times, block.refused, rows, before_sample)
 
     def first_events(self, block: SlotBlock) -> Iterator[np.ndarray]:
         """Yield the EVENT rows of the first run of a batch in a block, for some slots at a time."""
@@ -711,7 +720,8 @@ class SlotRuns:
         before_sample = np.zeros(len(self.setup.samples), dtype=np.int64)
         count = len(block.times.start)
         for first in range(0, count, size):
-            yield self._rows(block, first, min(first + size, count), before_sample)
+            rows = self._rows(block, first, min(first + size, count), before_sample)
+            yield with_refusals(self.setup, block.times, block.refused, rows, before_sample)[0]
 
     def _rows(
         self, block: SlotBlock, first: int, stop: int, before_sample: np.ndarray
@@ -746,6 +756,7 @@ class SlotRuns:
         setup, times, messages, counts = self.setup, block.times, block.messages, self.counts
         recorded, pairwise = times.recorded, setup.algorithm.timing.pairwise
         sensed, exchanged = recorded & times.sensed, recorded & times.exchanged
+        counts[:, REFUSE] += count_refusals(block.refused, sensed, self.runs)
         sensing = len(setup.sensing) * int((setup.stages.step < 0).sum())
         counts[:, SENSE] += sensing * int(sensed.sum())
         if pairwise:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import Filter, NodeInfo, may_be_silent
+from netkf.algorithms.gates import Gate
 from netkf.algorithms.kernels.run import opposite_links
 from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.models import SlotModel, first_roots
@@ -184,12 +185,21 @@ class SlotSetup:
                     self.regressor_sensors.append(assigned)
         linear = not self.regressor_sensors and not self.nonlinear_sensors
         all_fixed = len(self.kernel_sensors) == len(self.assigned) and linear
-        # Who is down has no reading.
-        self.varies = not all_fixed or bool(scenario.network.lives)
+        self.gate: Gate | None = scenario.filter.gate
+        # Who is down has no reading, and a gate changes H.
+        self.varies = not all_fixed or bool(scenario.network.lives) or self.gate is not None
         # The same in all blocks of runs and all slots, hence 1, 1.
         self.H: FloatArray = aligned((1, 1, self.estimators, self.p, self.columns.width, LANES))
         self._set_nonlinear_rows(scenario)
         self._set_kernel_sensors(scenario)
+
+    @cached_property
+    def gated_parts(self) -> list[list[tuple[int, int]]]:
+        """First row and number of rows of each sensor of each filter."""
+        return [
+            [(s.row, s.rows) for s in self.assigned if s.estimator == h]
+            for h in range(self.estimators)
+        ]
 
     def _set_pairs(self, pairs: SlotPairs, scenario: Scenario) -> np.ndarray:
         """Put readings of pairs behind those of own states; return how many rows these have."""

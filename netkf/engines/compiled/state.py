@@ -131,6 +131,8 @@ class Instants(Struct):
             none, NOBODY: one that nobody estimates
     rows, root : (L,) and the root of R (L, p, p), by sensor
     H : (M, p, n), by matrix, of the states of a filter, then of such a block
+    scale : (S,), by which the gate of a node multiplied each sample once it was whitened, 0 if it
+            ignores it; empty without a gate
     nonlinear : ``nonlinear_samples.NonlinearTable``
     """
 
@@ -145,6 +147,7 @@ class Instants(Struct):
     rows: IntArray
     root: FloatArray
     H: FloatArray
+    scale: FloatArray
     nonlinear: Any
 
 

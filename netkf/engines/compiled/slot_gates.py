@@ -1,0 +1,54 @@
+"""The events of gates in slots, added to the rows of all others."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from netkf.engines.compiled.slot_messages import SENSE, SlotTimes
+from netkf.engines.compiled.slot_setup import SlotSetup
+from netkf.linalg.arrays import IntArray
+from netkf.linalg.lanes import by_run
+from netkf.trace.schema import CODES
+
+REFUSE = CODES["refuse"]
+
+
+def count_refusals(refused: np.ndarray, counted: np.ndarray, runs: int) -> IntArray:
+    """Return how often gates refused in each run (R,), in the slots ``counted`` (S,), as
+    ``SlotPlan.refused`` (B, S, G, L) says it.
+    """
+    counts: IntArray = by_run(refused[:, counted].sum(axis=(1, 2), dtype=np.int64), runs)
+    return counts
+
+
+def with_refusals(
+    setup: SlotSetup,
+    times: SlotTimes,
+    refused: np.ndarray,
+    rows: np.ndarray,
+    before_sample: IntArray,
+) -> tuple[np.ndarray, IntArray]:
+    """Return EVENT ``rows`` (K,) of the first run with those of its gates, behind the readings of
+    their slots, and the number of rows before each sample, of ``before_sample`` (T,).
+    """
+    slots, parts = np.nonzero(refused[0, ..., 0])
+    if not len(slots):
+        return rows, before_sample
+    read = np.flatnonzero(rows["kind"] == SENSE)
+    stages, now = setup.stages, times.start[slots]
+    if (k := int(np.argmax(stages.step < 0))) > 0:
+        # Sensors are read when the exchange before has ended, as ``make_rows`` says it.
+        ended = np.rint((now + stages.end[k - 1]) * stages.per_second) / stages.per_second
+        now = np.where(times.exchanged[slots], ended, now)
+    # Behind the last reading of this time; slots of other rows have none.
+    first, last = (np.searchsorted(rows["t"][read], now, side=side) for side in ("left", "right"))
+    known = first < last
+    made = np.zeros(int(known.sum()), dtype=rows.dtype)
+    for name in ("peer", "message", "phase"):
+        made[name] = -1
+    made["t"], made["kind"], made["age"] = now[known], REFUSE, np.nan
+    nodes = np.full(1, -1) if setup.algorithm.timing.pooled else setup.nodes
+    made["node"] = nodes[np.array([s.estimator for s in setup.assigned])[parts[known]]]
+    places = read[last[known] - 1] + 1
+    shifted = before_sample + np.searchsorted(places, before_sample, side="right")
+    return np.insert(rows, places, made), shifted
