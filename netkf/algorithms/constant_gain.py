@@ -18,7 +18,7 @@ import numpy as np
 
 from netkf.algorithms.filter import Filter, NodeInfo
 from netkf.algorithms.kernels.constant_gains import correct_by_moments
-from netkf.algorithms.kernels.estimates import copy_vector, transform_root
+from netkf.algorithms.kernels.estimates import copy_root, copy_vector, transform_root
 from netkf.algorithms.kernels.gains import stack_gains
 from netkf.algorithms.kernels.neighbours import combine_convex
 from netkf.algorithms.kernels.root_flow import FlowTable, stack_tables
@@ -40,7 +40,7 @@ from netkf.core.fields import SourceFile, either, field, has_depth, list_of, mat
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.generic import drop_lane
-from netkf.linalg.lanes import load, store
+from netkf.linalg.lanes import any_lane, load, magnitude, spread, store
 from netkf.linalg.structs import Struct
 
 
@@ -70,13 +70,16 @@ def use_sample(record: Any, h: int, run: Any) -> None:
     """
     lanes, n, r = run.lanes, len(run.size), run.reading
     first, matrix = run.first_y + r, run.first_H + run.matrix[r]
-    # A node that is down has no reading, which zeros stand for.
-    is_read = False
+    # A node that is down, or whose gate takes nothing, has no reading, which zeros stand for.
+    weights = spread(lanes, 0.0)
     for i in range(run.rows[r]):
         for j in range(n):
-            is_read |= run.H[matrix, i, j, 0] != 0.0
-    if not is_read:
+            weights += magnitude(load(lanes, run.H, matrix, i, j))
+    unread = weights == 0.0
+    if not any_lane(weights > 0.0):
         return
+    if any_lane(unread):
+        copy_root(lanes, run.size, record.former, 0, record.root, h, True)
     # All innovations refer to the estimate before the reading: L is the gain of all its rows.
     copy_vector(lanes, run.size, record.mean, 0, record.xhat, h, True)
     for i in range(run.rows[r]):
@@ -88,6 +91,8 @@ def use_sample(record: Any, h: int, run: Any) -> None:
             store(lanes, record.xhat, h, j, moved)
     scratch = run.moved, run.noise
     transform_root(lanes, run.size, record.root, h, record.remaining[h], record.noise[h], scratch)
+    if any_lane(unread):
+        copy_root(lanes, run.size, record.root, h, record.former, 0, unread)
 
 
 @kernel
@@ -152,7 +157,9 @@ def constant_gain_record(
     if isinstance(models[0], FlowModel):
         settings["loops"] = _closed_loops(models, gains)
     return Record(
-        payload={"xhat": (n,), "root": (n, n)}, scratch={"mean": (1, n)}, settings=settings
+        payload={"xhat": (n,), "root": (n, n)},
+        scratch={"mean": (1, n), "former": (1, n, n)},
+        settings=settings,
     )
 
 

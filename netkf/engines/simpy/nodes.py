@@ -298,8 +298,14 @@ class Node:
         if self._gate is None:
             return samples
         factors = [self._gate_factor(sample, time, -1, recorder) for sample in samples]
-        pairs = zip(samples, factors, strict=True)
-        return [(y, H, factor * R) for (y, H, R), factor in pairs if np.isfinite(factor)]
+        passed: list[Sample] = []
+        for (y, H, R), factor in zip(samples, factors, strict=True):
+            if np.isfinite(factor):
+                passed.append((y, H, factor * R))
+            elif self.algorithm.needs.every_reading:
+                # Its gains belong to rows, which stay: zeros tell nothing.
+                passed.append((0.0 * y, 0.0 * H, R))
+        return passed
 
     def _gate_factor(self, sample: Sample, time: float, peer: int, recorder: Recorder) -> float:
         """Return by what the gate multiplies R of a sample of ``peer`` (id, -1: its own)."""
