@@ -9,7 +9,11 @@ import scipy.stats
 
 import netkf
 from netkf.algorithms.gates import Gate
+from netkf.engines.compiled.engine import CompiledEngine
 from netkf.trace.schema import CODES
+from tests.conftest import SCENARIOS
+from tests.engines.agreement import assert_agree
+from tests.engines.test_batches import assert_alone
 
 SLOTS = """
 format = 1
@@ -214,3 +218,139 @@ def test_readings_of_others_pass_the_gate_too(scenario_of, tmp_path, then):
             for row in rows]  # fmt: skip
     assert sorted(told) == sorted(refused)
     assert any(i != j for _, i, j in refused)
+
+
+# In slots and under clocks: a network of three nodes that lose messages, one with a bad sensor.
+FILTERS = {
+    "slots": {
+        "local": 'kind = "local"',
+        "hcmci": 'kind = "hcmci"',
+        "diffusion": 'kind = "diffusion"',
+        "constant-gain": 'kind = "constant-gain"\ngain = [{gain}, {wide}, {gain}]',
+    },
+    "clocks": {
+        "central": 'kind = "central"',
+        "gossip": 'kind = "gossip"',
+        "hybrid": 'kind = "hybrid"\nepsilon = 0.1',
+        "hcmci": 'kind = "hcmci"\nconsensus = "information"',
+    },
+}
+GAINS = {"gain": "[[0.3, 0.1], [0.0, 0.3]]", "wide": "[[0.3, 0.1, 0.1], [0.0, 0.3, 0.2]]"}
+LOSS = 'channel = {{ loss = {{ kind = "bernoulli", delivery = 0.7 }} }}\n'
+OUTLIERS = 'fault = {{ kind = "outliers", probability = 0.3, sigma = 20.0 }}\nnodes = [1]'
+
+
+def network_of(time, name):
+    """The text of a scenario with a filter in ``time``, with a bad sensor at node 1."""
+    activation = '{{ kind = "broadcast" }}'
+    if time == "clocks":
+        activation = '{{ kind = "poisson", rate = 1.0 }}'
+    text = {"slots": SLOTS, "clocks": CLOCKS}[time].replace("nodes = 2 }}", "nodes = 3 }}")
+    text = text.replace("nodes = [0, 1]", "nodes = [0, 1, 2]").replace("nodes = [1]", OUTLIERS)
+    if name not in ("local", "central"):
+        text = text.replace("[filter]", f"activation = {activation}\n{LOSS}[filter]")
+    return text.replace('kind = "local"', FILTERS[time][name].format(**GAINS))
+
+
+@pytest.mark.parametrize("then", ["ignore", "inflate"])
+@pytest.mark.parametrize(
+    ("time", "name"), [(time, name) for time, names in FILTERS.items() for name in names]
+)
+def test_both_engines_refuse_the_same_readings(scenario_of, time, name, then):
+    text = network_of(time, name)
+    run = assert_agree(scenario_of(text, f'probability = 0.95, then = "{then}"', 12.0))
+    assert run.count("refuse") > 3
+
+
+@pytest.mark.parametrize("time", FILTERS)
+def test_batches_hold_the_single_runs(scenario_of, time):
+    """Nine runs are more than a block of lanes holds, and each refuses other readings."""
+    text = network_of(time, {"slots": "constant-gain", "clocks": "hybrid"}[time])
+    then, text = ("ignore", text.replace(LOSS, "")) if time == "slots" else ("inflate", text)
+    scenario = scenario_of(text, f'probability = 0.95, then = "{then}"', 6.0)
+    count = {"slots": 9, "clocks": 3}[time]
+    assert_alone(scenario, CompiledEngine(), 5, range(2, 2 + count), fingerprint=True)
+
+
+@pytest.mark.parametrize("time", FILTERS)
+def test_a_gate_that_never_fires_changes_no_bit(scenario_of, time):
+    text = network_of(time, "hcmci").replace(OUTLIERS, "nodes = [1]")
+    wide = scenario_of(text, "probability = 0.999999999999", 12.0)
+    without = dataclasses.replace(wide, filter=dataclasses.replace(wide.filter, gate=None))
+    runs = [netkf.simulate(one, engine="compiled") for one in (wide, without)]
+    assert runs[0].fingerprint == runs[1].fingerprint
+    assert np.array_equal(runs[0].P, runs[1].P)
+    assert np.array_equal(runs[0].xhat, runs[1].xhat)
+
+
+LATE = 'channel = {{ delay = {{ kind = "uniform", low = 0.0, high = 0.6 }} }}\n'
+LIVES = '[[network.lives]]\nnodes = [0, 1]\nkind = "crashes"\nmean_up = 5.0\nmean_down = 3.0\n'
+
+
+def test_messages_that_python_makes_and_nodes_that_are_down(scenario_of):
+    text = network_of("slots", "hcmci").replace(LOSS, LATE + LIVES)
+    text = text.replace('"broadcast"', '"broadcast", phase = 0.3')
+    run = assert_agree(scenario_of(text, 'probability = 0.9, then = "ignore"', 15.0))
+    assert min(run.count(kind) for kind in ("refuse", "crash", "late")) > 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("then", ["ignore", "inflate"])
+@pytest.mark.parametrize("name", ["range_tracking", "formation"])
+def test_nonlinear_readings_pass_the_gate_once_they_are_linearised(name, then):
+    folder = {"range_tracking": "nonlinear", "formation": "blocks"}[name]
+    scenario = netkf.load(SCENARIOS / folder / f"{name}.toml").replace({"horizon": 15.0})
+    scenario = scenario.replace({"filter.gate": {"probability": 0.7, "then": then}})
+    assert assert_agree(scenario).count("refuse") > 10
+
+
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_gains_stay_with_their_rows(scenario_of, tmp_path, engine):
+    """Of two sensors the gate refuses either: the other keeps its column of a constant gain."""
+    rng = np.random.default_rng(7)
+    y, horizon = rng.normal(size=(31, 2)) * 2.0, 30
+    start, network = SLOTS.index("[[sensors]]"), SLOTS.index("[network]")
+    sensors, H = "", np.array([[1.0, 0.0], [1.0, 1.0]])
+    for k, row in enumerate(H.tolist()):
+        lines = [f"{t}.0,1,{float(y[t, k])!r}" for t in range(horizon + 1)]
+        (tmp_path / f"y{k}.csv").write_text("\n".join(["t,node,y0", *lines]) + "\n")
+        sensors += f'[[sensors]]\nkind = "recorded"\npath = "y{k}.csv"\nH = [{row}]\nR = [[0.5]]\n'
+    text = SLOTS[:start] + sensors + SLOTS[network:]
+    L = np.array([[0.4, 0.05], [0.1, 0.3]])
+    text = text.replace('"local"', f'"constant-gain"\ngain = {L.tolist()}')
+    text = text.replace("[filter]", 'activation = {{ kind = "broadcast" }}\n[filter]', 1)
+    text = text.replace('kind = "path", nodes = 2', 'kind = "edges", edges = [], nodes = 2')
+    run = netkf.simulate(scenario_of(text, "probability = 0.8", float(horizon)), engine=engine)
+    F, Q = np.array([[0.9, 0.3], [0.0, 0.8]]), np.diag([0.2, 0.3])
+    x, P, limit, refusals = np.zeros(2), np.eye(2), scipy.stats.chi2.ppf(0.8, 1), []
+    for k in range(1, horizon):
+        x, P = F @ x, F @ P @ F.T + Q
+        z = y[k] - H @ x
+        taken = z**2 / (np.sum(H @ P * H, axis=1) + 0.5) <= limit
+        x = x + L[:, taken] @ z[taken]
+        if taken.any():
+            # As if all had been taken, which this filter says of itself.
+            A = np.eye(2) - L @ H
+            P = A @ P @ A.T + 0.5 * L @ L.T
+        refusals += [k] * int((~taken).sum())
+        np.testing.assert_allclose(run.xhat[k, 1], x, rtol=1e-9, atol=1e-11)
+        np.testing.assert_allclose(run.P[k, 1], P, rtol=1e-9, atol=1e-11)
+    assert run.log[run.log["kind"] == CODES["refuse"]]["t"].tolist() == refusals
+    assert len(set(refusals)) < len(refusals) < 2 * horizon - 10
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"filter": {"kind": "intermittent"}}, "readings that messages bring"),
+        ({"filter.linearise": "ukf"}, "nonlinear readings at sigma points"),
+    ],
+)
+def test_what_the_compiled_engine_leaves_to_simpy(changes, words):
+    file = {"filter": "intermittent_scalar.toml"}.get(next(iter(changes)))
+    scenario = netkf.load(SCENARIOS / (file or "nonlinear/range_tracking.toml"))
+    gate = {"probability": 0.9}
+    scenario = scenario.replace({**changes, "horizon": 2.0}).replace({"filter.gate": gate})
+    with pytest.raises(netkf.EngineError, match=f"cannot run a gate on {words}; use engine="):
+        netkf.simulate(scenario, engine="compiled")
+    assert netkf.simulate(scenario).engine == "simpy"

@@ -15,6 +15,7 @@ from netkf.core.fields import Component
 from netkf.engines.base import Engine, Progress
 from netkf.engines.compiled.batches import flow_batches, quick_runs
 from netkf.engines.compiled.flow import FlowRun, Source, Workspace
+from netkf.engines.compiled.gates import ungated_readings
 from netkf.engines.compiled.own_sensors import is_own, reads_in_python
 from netkf.engines.compiled.slot_pairs import blocks_refusal
 from netkf.engines.compiled.slot_run import run_slots, slot_batches, with_ends
@@ -42,19 +43,6 @@ PLANTS = (
     *(Diffusion, NonlinearDiffusion, RecordedDiffusion, UnknownDiffusion),
     *(LinearPlant, NonlinearPlant, RecordedPlant, UnknownPlant),
 )
-
-
-def gate_refusal(scenario: Scenario) -> str | None:
-    """Return which readings a gate of this scenario looks at that kernels do not; None if none."""
-    algorithm, kernels = scenario.node_filter, scenario.node_filter.kernels
-    if algorithm.timing.talks and kernels is not None and kernels.sends_readings:
-        return "readings that messages bring"
-    if not all(sensor.linear for sensor in scenario.sensors):
-        if scenario.views is not None:
-            return "nonlinear readings of nodes that estimate different states"
-        if scenario.filter.linearise != "ekf":
-            return "nonlinear readings at sigma points"
-    return None
 
 
 @dataclass(frozen=True)
@@ -92,6 +80,8 @@ class CompiledEngine(Engine):
             rule = "radios of nodes that estimate different states"
         elif network.lives and scenario.slotted and scenario.views is not None:
             rule = "nodes that are down at times and estimate different states in slots"
+        elif (ungated := ungated_readings(scenario)) is not None:
+            rule = f"a gate on {ungated}"
         if rule:
             return f'engine "compiled" cannot run {rule}; {remedy}'
         if compiled_kernels(scenario.node_filter, not scenario.slotted) is None:
@@ -100,8 +90,6 @@ class CompiledEngine(Engine):
                 f'engine "compiled" has no code for the filter {name!r}, whose methods are plain '
                 f"Python; {remedy}, or write them as kernels (netkf.kernels)"
             )
-        if scenario.filter.gate is not None and (rule := gate_refusal(scenario)) is not None:
-            return f'engine "compiled" cannot run a gate on {rule}; {remedy}'
         return None
 
     def announce(self, scenario: Scenario) -> None:

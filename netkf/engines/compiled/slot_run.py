@@ -21,11 +21,11 @@ from netkf.algorithms.kernels.nonlinear_rows import NonlinearRows, add_values
 from netkf.algorithms.kernels.pairs import Pairs
 from netkf.core.memory import ReusableMemory, keep_freed_memory
 from netkf.engines.base import Progress
+from netkf.engines.compiled.gates import REFUSE, count_refusals, with_refusals
 from netkf.engines.compiled.outcomes import channel_streams
 from netkf.engines.compiled.own_sensors import read_whitened
 from netkf.engines.compiled.samples import by_node, record_samples
 from netkf.engines.compiled.slot_filters import SlotFilters
-from netkf.engines.compiled.slot_gates import REFUSE, count_refusals, with_refusals
 from netkf.engines.compiled.slot_loop import WHOLE, SlotSamples
 from netkf.engines.compiled.slot_messages import (
     ABSORB,

@@ -1,4 +1,4 @@
-"""The events of gates in slots, added to the rows of all others."""
+"""Gates: which readings they look at, and their events in slots."""
 
 from __future__ import annotations
 
@@ -8,9 +8,26 @@ from netkf.engines.compiled.slot_messages import SENSE, SlotTimes
 from netkf.engines.compiled.slot_setup import SlotSetup
 from netkf.linalg.arrays import IntArray
 from netkf.linalg.lanes import by_run
+from netkf.scenario.scenario import Scenario
 from netkf.trace.schema import CODES
 
 REFUSE = CODES["refuse"]
+
+
+def ungated_readings(scenario: Scenario) -> str | None:
+    """Return which readings a gate would have to look at that kernels do not; None if it need not,
+    or there is no gate.
+    """
+    algorithm, kernels = scenario.node_filter, scenario.node_filter.kernels
+    if scenario.filter.gate is None:
+        return None
+    if algorithm.timing.talks and kernels is not None and kernels.sends_readings:
+        return "readings that messages bring"
+    if not scenario.has_linear_sensors and scenario.views is not None:
+        return "nonlinear readings of nodes that estimate different states"
+    if not scenario.has_linear_sensors and scenario.filter.linearise != "ekf":
+        return "nonlinear readings at sigma points"
+    return None
 
 
 def count_refusals(refused: np.ndarray, counted: np.ndarray, runs: int) -> IntArray:
