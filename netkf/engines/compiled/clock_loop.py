@@ -468,9 +468,9 @@ def whiten_instant(state: Simulation, run: ClockRun, r: int, instant: int) -> No
     run, multiplied by the inverse of the root of R, so that the noise of each row has variance 1.
     """
     instants, row = state.instants, 0
+    gated = len(instants.scale) > 0
     for s in range(instants.first[instant], instants.first[instant + 1]):
         # Readings of pairs are for others.
-        gated = len(instants.scale) > 0
         if instants.block[s] == -1 and not (gated and instants.scale[s] == 0.0):
             whiten_sample(instants, run, r, s, row, len(run.size))
             if gated and instants.scale[s] != 1.0:
