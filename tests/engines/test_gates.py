@@ -287,10 +287,12 @@ LATE = 'channel = {{ delay = {{ kind = "uniform", low = 0.0, high = 0.6 }} }}\n'
 LIVES = '[[network.lives]]\nnodes = [0, 1]\nkind = "crashes"\nmean_up = 5.0\nmean_down = 3.0\n'
 
 
-def test_messages_that_python_makes_and_nodes_that_are_down(scenario_of):
+def test_messages_that_are_late_and_nodes_that_are_down(scenario_of):
     text = network_of("slots", "hcmci").replace(LOSS, LATE + LIVES)
     text = text.replace('"broadcast"', '"broadcast", phase = 0.3')
-    run = assert_agree(scenario_of(text, 'probability = 0.9, then = "ignore"', 15.0))
+    scenario = scenario_of(text, 'probability = 0.9, then = "ignore"', 15.0)
+    run = assert_agree(scenario)
+    assert_alone(scenario, CompiledEngine(), 5, range(2, 5), fingerprint=True)
     assert min(run.count(kind) for kind in ("refuse", "crash", "late")) > 3
 
 

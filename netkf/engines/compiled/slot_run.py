@@ -743,11 +743,14 @@ class SlotRuns:
         """Add the events of a block to ``self.counts`` (R, KINDS)."""
         setup, times, counts = self.setup, block.times, self.counts
         for r, tables in enumerate(self._tables):
-            stopped = counts[r, STOP]
+            # What tables do not know.
+            known = counts[r, [STOP, REFUSE]]
             counts[r] = tables.counts
-            counts[r, STOP] = stopped
+            counts[r, [STOP, REFUSE]] = known
         if not self._tables:
             self._count_drawn(block)
+        refused = times.recorded & times.sensed
+        counts[:, REFUSE] += count_refusals(block.refused, refused, self.runs)
         if setup.stages.stopping >= 0:
             since = by_run(self._stopped, self.runs) - times.first
             counts[:, STOP] += ((since >= 0) & (since < times.recorded.sum())).sum(axis=1)
@@ -756,7 +759,6 @@ class SlotRuns:
         setup, times, messages, counts = self.setup, block.times, block.messages, self.counts
         recorded, pairwise = times.recorded, setup.algorithm.timing.pairwise
         sensed, exchanged = recorded & times.sensed, recorded & times.exchanged
-        counts[:, REFUSE] += count_refusals(block.refused, sensed, self.runs)
         sensing = len(setup.sensing) * int((setup.stages.step < 0).sum())
         counts[:, SENSE] += sensing * int(sensed.sum())
         if pairwise:
