@@ -57,7 +57,7 @@ def gate_tables(
     list of parts the (row, length) of each of its ``parts``.
     """
     every = np.array([part for some in parts for part in some], dtype=np.int64).reshape(-1, 2)
-    most = int(every[:, 1].max(initial=1))
+    most = int(every[:, 1].max(initial=0))
     return GateTables(
         limits=np.array([math.inf, *(gate.limit(p) for p in range(1, most + 1))]),
         inflates=gate.then == "inflate",
