@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.core.errors import ScenarioError, errors_under
+from netkf.core.errors import ScenarioError, errors_under, suggest_nearest
 from netkf.core.places import Place
 from netkf.network.graphs import Topology
 from netkf.plants.blocks import Layout
@@ -63,6 +63,9 @@ def support_of(sensor: Any, n: int) -> np.ndarray:
     return np.flatnonzero(np.concatenate(matrices).any(axis=0))
 
 
+CHOICES = ("all", "own", "own+neighbours", "shared")
+
+
 def estimated_blocks(
     estimates: str | tuple[str, ...], layout: Layout, topology: Topology
 ) -> tuple[tuple[Place, ...], ...]:
@@ -79,7 +82,15 @@ def estimated_blocks(
             linked = {*topology.senders(node), *topology.receivers(node)}
             own = tuple(p for one in (node, *sorted(linked)) for p in layout.owned(one))
         else:
-            own = tuple(layout.require(name, node) for name in dict.fromkeys(estimates))
+            names = (estimates,) if isinstance(estimates, str) else estimates
+            if isinstance(estimates, str) and estimates not in layout.names:
+                rule = 'must be "all", "own", "own+neighbours", "shared", or names of [[plants]]'
+                listed = ", ".join(f'"{name}"' for name in layout.names)
+                remedy = (
+                    f"{suggest_nearest(estimates, (*CHOICES, *layout.names))}names are {listed}"
+                )
+                raise ScenarioError("", rule, estimates, remedy)
+            own = tuple(layout.require(name, node) for name in dict.fromkeys(names))
         if not own:
             rule = f"must give every node a block, and node {node} has none"
             raise ScenarioError("", rule, estimates, "give it one in [[plants]], or choose others")

@@ -143,11 +143,7 @@ class Belief(Component):
     schedule: bool = field(boolean, default=True)
 
 
-_estimates = either(
-    one_of("all", "own", "own+neighbours", "shared"),
-    list_of(text, "names of blocks"),
-    has_depth(1),
-)
+_estimates = either(text, list_of(text, "names of blocks"), has_depth(1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+from netkf.algorithms.kernels.maps import METHODS
 from netkf.scenario.checks import check_scenario
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.records import record_notes
@@ -82,7 +83,27 @@ class Scenario(DerivedScenario):
             *stamp_notes(self),
             *grid_notes(self),
             *self._share_notes,
+            *self._unused_notes,
         )
+
+    @property
+    def _unused_notes(self) -> tuple[str, ...]:
+        notes = []
+        for key, plant in dict(self.all_plants).items():
+            late = [c.start for c in getattr(plant, "schedule", ()) if c.start >= self.horizon]
+            if late:
+                entries = "1 entry is" if len(late) == 1 else f"{len(late)} entries are"
+                notes.append(
+                    f"{key}.schedule: {entries} never used, from {late[0]:g} s on, because the "
+                    f"horizon is {self.horizon:g}"
+                )
+        parts = self.plant, *self.sensors
+        if self.filter.linearise != METHODS[0] and all(part.linear for part in parts):
+            kept = f'linearise = "{self.filter.linearise}"'
+            notes.append(
+                f"filter.linearise: {kept} changes nothing, because plant and sensors are linear"
+            )
+        return tuple(notes)
 
     @property
     def _share_notes(self) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ import netkf
 from netkf.engines.simpy.engine import SimpyEngine
 from netkf.scenario.reading import from_table, load
 from netkf.scenario.writing import as_table, resolve_defaults, to_toml
-from tests.conftest import scenario_files
+from tests.conftest import SCENARIOS, scenario_files
 
 
 @pytest.mark.one_in(3)
@@ -146,3 +146,24 @@ def test_a_class_of_the_user_needs_no_registration(tmp_path, monkeypatch, ring):
         netkf.theory.error_covariance(ring.replace({"network.graph.nodes": 5}), run)
     with pytest.raises(netkf.ScenarioError, match=r"filter\.share: must be a finite number"):
         scenario.replace({"filter.share": 2.0})
+
+
+def test_what_a_run_never_uses_is_noted():
+    ring = netkf.load(SCENARIOS / "poisson_ring.toml")
+    zero = (0.0 * ring.plant.A).tolist()
+    schedule = [{"from": 2.0, "A": zero}, {"from": ring.horizon, "A": zero}]
+    changed = ring.replace({"plant.schedule": schedule, "filter.linearise": "ukf"})
+    assert [note.split(":")[0] for note in changed.notes] == ["plant.schedule", "filter.linearise"]
+    assert "1 entry is never used, from 20 s on" in changed.notes[0]
+    assert ring.replace({"plant.schedule": schedule[:1]}).notes == ring.notes == ()
+    curved = netkf.load(SCENARIOS / "blocks" / "cooperative_localisation.toml")
+    assert curved.replace({"filter.linearise": "ukf"}).notes == curved.notes
+
+
+def test_one_block_may_be_named_without_a_list():
+    robots = netkf.load(SCENARIOS / "blocks" / "cooperative_localisation.toml")
+    named = robots.replace({"filter.estimates": "pose"})
+    listed = robots.replace({"filter.estimates": ["pose"]})
+    assert named.estimated == listed.estimated == robots.estimated
+    with pytest.raises(netkf.ScenarioError, match=r'did you mean "own"\? names are "pose"'):
+        robots.replace({"filter.estimates": "owm"})
