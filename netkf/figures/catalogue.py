@@ -140,10 +140,11 @@ def plot_to_files(result: Any, names: tuple[str, ...], out: Path, file_format: s
     if is_file and len(names) > 1:
         rule, remedy = "is one file for several figures", "name a directory, or one --figure"
         raise ScenarioError("--out", rule, str(out), remedy)
-    # All are drawn before the first is written: unknown names leave no files.
-    figures = {name: figure_set.draw(name, omit_slow=omit_slow) for name in names}
     paths = {name: out if is_file else out / f"{name}.{file_format}" for name in names}
-    for name, figure in figures.items():
-        make_directory(paths[name].parent)
-        write_figure(figure, paths[name])
+    with style_context():
+        # All are drawn before the first is written: unknown names leave no files.
+        figures = {name: figure_set.draw(name, omit_slow=omit_slow) for name in names}
+        for name, figure in figures.items():
+            make_directory(paths[name].parent)
+            write_figure(figure, paths[name])
     return list(paths.values())

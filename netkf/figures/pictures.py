@@ -15,7 +15,7 @@ def run_picture(scenario: Scenario, completed: CompletedRun) -> None:
     """Write the overview of a run as ``run.png``; raises WriteError."""
     with style_context():
         figure = overview(reduce_completed_run(scenario, completed))
-    write_figure(figure, completed.directory / "run.png")
+        write_figure(figure, completed.directory / "run.png")
 
 
 def ensemble_picture(scenario: Scenario, finished: FinishedEnsemble) -> None:

@@ -65,6 +65,9 @@ TITLE_SIZE, CAPTION_SIZE, LEGEND_SIZE = 10.5, 7.5, 7.5
 """Font sizes in points."""
 
 
+_is_styled: list[bool] = []
+
+
 class Picture(Figure):
     """A figure that notebooks display without pyplot."""
 
@@ -77,12 +80,21 @@ class Picture(Figure):
 
 @contextlib.contextmanager
 def style_context() -> Iterator[None]:
-    """Set the style of netkf's figures within the block, whatever the user's settings are."""
+    """Set the style of netkf's figures within the block, whatever the user's settings are; a block
+    within such a block has it already.
+    """
+    if _is_styled:
+        yield
+        return
     with mpl.rc_context():
         mpl.rcdefaults()
         parameters: Any = mpl.rcParams
         parameters.update(RC)
-        yield
+        _is_styled.append(True)
+        try:
+            yield
+        finally:
+            _is_styled.clear()
 
 
 def new_figure(width: float = 7.4, height: float = 4.4) -> Picture:
