@@ -139,3 +139,13 @@ def diffusion(nodes=20, m=5):
 def central():
     """One filter with both sensors of push_sum_planar, shown in each of 200 slots."""
     return load("push_sum_planar").replace({"filter": {"kind": "central"}, "horizon": 50.0})
+
+
+def push_sum_with(**channel):
+    """push_sum_planar, 40 s, whose channel has other losses or delays: tables of messages."""
+    short = load("push_sum_planar").replace({"horizon": 40.0})
+    return short.replace({f"network.channel.{key}": value for key, value in channel.items()})
+
+
+SHARED = {"kind": "shared", "delivery": 0.7, "share": 0.3}
+LATE = {"kind": "uniform", "low": 0.0, "high": 0.05}
