@@ -270,38 +270,46 @@ class SlotTables:
         # A link is drawn for even if nobody sends, so that the network does not depend on filters.
         fresh = self._setup.fresh[step]
         number = numbers_of(link, fresh, self._drawn)
-        slot, step, place, fresh, number = (
-            np.repeat(column, each) for column in (slot, step, place, fresh, number)
-        )
+        slot, step, place, number = (np.repeat(c, each) for c in (slot, step, place, number))
         w = (link[:, None] * each + np.arange(each)).ravel()
         draws = self._draws.rows(senders.source[w], number)
-        if self._shared is not None:
-            self._share(slot * len(self._setup.fresh) + step, self._sender[w], fresh, draws)
         uses = Uses(
             slot, step, place, w, ups, np.ones(len(w), dtype=bool), np.full(len(w), NAN), *draws
         )
+        if self._shared is not None:
+            self._share(uses, len(times.start))
         self._links = []
         if self._reach is not None:
             self._look(times, uses)
         self._uses = uses
         return uses
 
-    def _share(
-        self, moment: IntArray, sender: IntArray, fresh: np.ndarray, draws: FloatArray
-    ) -> None:
-        """Write what all hearers of a broadcast share into ``draws`` (3, D) of uses; those with one
-        ``moment`` (D,) are of one step.
+    def _share(self, uses: Uses, count: int) -> None:
+        """Write what all hearers of a broadcast share into what was drawn for the ``uses`` of so
+        many slots.
         """
-        nodes = len(self._scenario.nodes)
-        key, first, back = np.unique(
-            moment * nodes + sender, return_index=True, return_inverse=True
-        )
-        of_sender = key % nodes
-        numbers = numbers_of(of_sender, fresh[first], self._shared_drawn)
+        _, step, sender, back = self._transmissions(uses, count)
+        numbers = numbers_of(sender, self._setup.fresh[step], self._shared_drawn)
         assert self._shared is not None
-        shared = self._shared.rows(of_sender, numbers)[:, back]
-        known = ~np.isnan(shared)
-        draws[:2][known] = shared[known]
+        shared = self._shared.rows(sender, numbers)[:, back]
+        for own, common in zip((uses.uniform, uses.bad), shared, strict=True):
+            known = ~np.isnan(common)
+            own[known] = common[known]
+
+    def _transmissions(
+        self, uses: Uses, count: int
+    ) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+        """Return the slot, step and sender (K,) of each transmission of ``uses`` in so many slots,
+        in the order of time, and the number (D,) of the transmission of each use: one is for all
+        hearers.
+        """
+        steps, nodes = len(self._setup.fresh), len(self._ids)
+        key = (uses.slot * steps + uses.step) * nodes + self._sender[uses.w]
+        is_sent = np.zeros(count * steps * nodes, dtype=bool)
+        is_sent[key] = True
+        moment, sender = np.divmod(np.flatnonzero(is_sent), nodes)
+        slot, step = np.divmod(moment, max(steps, 1))
+        return slot, step, sender, (np.cumsum(is_sent) - 1)[key]
 
     def _used_links(self, times: StepTimes) -> tuple[IntArray, IntArray, IntArray, IntArray, Any]:
         """Return the slot, step, place in the step and link of each use of a link, (U,) each, and
@@ -413,7 +421,7 @@ class SlotTables:
         w = uses.w
         number = numbers_of(w, np.ones(len(w), dtype=bool), self._sent_so_far)
         begin, closes = times.begin[uses.slot, uses.step], times.end[uses.slot, uses.step]
-        delay = self._grid.snap(self._delays(uses, number, begin) + self._waits(uses, begin))
+        delay = self._grid.snap(self._delays(uses, number, begin) + self._waits(uses, times))
         arrival, receiver = self._grid.snap(begin + delay), self._receiver[w]
         lost, absorbed = np.zeros(len(w), dtype=bool), arrival <= closes
         if self._scenario.network.lives:
@@ -450,19 +458,16 @@ class SlotTables:
             delays[one] = message_delays(self._channel, sent, uniform[one], drawn[one])
         return np.where(delays >= 0.0, delays, NAN)
 
-    def _waits(self, uses: Uses, begin: FloatArray) -> Any:
+    def _waits(self, uses: Uses, times: StepTimes) -> Any:
         """Return the seconds (K,) until radios have sent the last bit, nan if it is dropped."""
         if self._airtime is None:
             return 0.0
-        sender = self._sender[uses.w]
-        key = (uses.slot * len(self._setup.fresh) + uses.step) * len(self._ids) + sender
-        # One transmission for all hearers.
-        _, first, back = np.unique(key, return_index=True, return_inverse=True)
-        waits, of_sender, phase = np.zeros(len(first)), sender[first], self._phase[uses.step[first]]
-        for h in np.unique(of_sender).tolist():
-            own, node = of_sender == h, int(self._ids[h])
+        slot, step, sender, back = self._transmissions(uses, len(times.start))
+        begin, phase, waits = times.begin[slot, step], self._phase[step], np.zeros(len(slot))
+        for h in np.unique(sender).tolist():
+            own, node = sender == h, int(self._ids[h])
             sizes = [self._scenario.message_size(node, k) for k in phase[own].tolist()]
-            waits[own] = self._airtime.waits(node, sizes, begin[first[own]])
+            waits[own] = self._airtime.waits(node, sizes, begin[own])
         return waits[back]
 
     def _count(
