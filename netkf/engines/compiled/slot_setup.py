@@ -366,7 +366,7 @@ class SlotSetup:
             self.deliveries = channel.loss.deliveries
             channel = dataclasses.replace(channel, loss=channel.loss.given)
         self.channel, loss = channel, channel.loss
-        # The probabilities of a user's own loss model are computed in Python, message by message.
+        # Numpy computes the probabilities of a user's own loss model (slot_tables).
         has_known_law = identical_per_link(loss) or type(loss) is GilbertElliott
         has_known_law &= scenario.network.radio is None
         self.has_known_probabilities = has_known_law and draws_per_link(channel)
