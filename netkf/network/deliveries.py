@@ -35,7 +35,7 @@ class Deliveries:
 
     def __init__(self) -> None:
         self.choose(frozenset())
-        self._given: dict[tuple[Link, int, int], FloatArray] = {}
+        self._given: dict[tuple[Link, int, int, float], FloatArray] = {}
 
     def choose(self, chosen: Chosen | None, without_delay: Chosen = frozenset()) -> None:
         """Deliver these messages in the next replay."""
@@ -46,7 +46,9 @@ class Deliveries:
 
     def given(self, loss: Loss, sent: Transmission) -> FloatArray:
         """Return the delivery probabilities (K,) of ``sent``, the same in each replay."""
-        key = sent.link, int(sent.number[0]) if len(sent.number) else 0, len(sent.number)
+        # A message has another time if a node that decides was silent before.
+        number, time = (sent.number[0], sent.time[0]) if len(sent.number) else (0, 0.0)
+        key = sent.link, int(number), len(sent.number), float(time)
         if key not in self._given:
             self._given[key] = delivery_probabilities(loss, sent)
         return self._given[key]

@@ -14,6 +14,7 @@ import netkf
 from netkf.cli.main import main
 from netkf.core.errors import ScenarioError
 from netkf.network.deliveries import Deliveries, MessageKey
+from netkf.network.losses import Transmission
 from netkf.scenario.reading import from_table
 from netkf.studies.information import (
     KeptReadings,
@@ -532,3 +533,18 @@ def test_a_directory_that_cannot_be_explained_is_refused_in_one_line(kept, capsy
         assert words in printed.err
         assert printed.err.count("\n") == 1
         assert not printed.out
+
+
+def test_a_message_that_is_sent_at_another_time_meets_another_law():
+    """In a replay a node that decides may have been silent before: numbers then move in time."""
+
+    class Later(netkf.parts.Loss):
+        vectorised = True
+
+        def delivery_probability(self, sent):
+            return 0.1 * sent.time
+
+    loss, deliveries = Later(), Deliveries()
+    for time in (1.0, 2.0, 1.0):
+        sent = Transmission((0, 1), number=np.array([3]), time=np.array([time]))
+        assert deliveries.given(loss, sent) == 0.1 * time
