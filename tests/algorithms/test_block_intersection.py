@@ -275,7 +275,7 @@ def test_shared_blocks_are_estimated_by_any_filter(tmp_path: Path) -> None:
         ({"filter": {"kind": "kcf", "estimates": "own"}}, "filter.estimates", "say no blocks"),
         ({"filter": {"kind": "local", "estimates": "own"}}, "sensors[1]", "must read blocks"),
         ({"filter__estimates": "shared"}, "filter.estimates", "node 1 has none"),
-        ({"filter__estimates": "ours"}, "filter.estimates", "must be one of"),
+        ({"filter__estimates": "ours"}, "filter.estimates", 'must be "all", "own"'),
         ({"filter__estimates": ["poses"]}, "filter.estimates", "name of one of"),
         ({"plants__0__nodes": [1, 2]}, "filter.estimates", "node 3 has none"),
         (

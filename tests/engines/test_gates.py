@@ -252,6 +252,7 @@ def network_of(time, name):
     return text.replace('kind = "local"', FILTERS[time][name].format(**GAINS))
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("then", ["ignore", "inflate"])
 @pytest.mark.parametrize(
     ("time", "name"), [(time, name) for time, names in FILTERS.items() for name in names]

@@ -161,7 +161,7 @@ def _rounds(folder, phases, steps):
     return "rounds.csv"
 
 
-@pytest.mark.one_in(8)
+@pytest.mark.one_in(14)
 @pytest.mark.parametrize("seed", range(200))
 def test_both_engines_and_batches_make_the_same_runs(seed, tmp_path):
     scenario = drawn(seed, tmp_path)

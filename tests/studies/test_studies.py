@@ -615,7 +615,9 @@ def test_a_search_says_what_the_centralised_filter_has_and_which_key_helps():
             ("sensors.0.R", [[0.25 / 1.1]]),
         )
     }
-    assert f"fall most with {min(worst, key=worst.get)} = " in found.central
+    # Arrivals count by the product of delivery and epsilon, so that these two are one up to digits.
+    first = found.central.partition("fall most with ")[2].partition(" = ")[0]
+    assert worst[first] <= (1.0 + 1e-9) * min(worst.values())
     hopeless = netkf.size(scenario, RATE, 10.0, 20.0, f"worst_rms<={0.9 * error}", by="theory")
     assert not hopeless
     assert "no exchange of messages reaches the limit" in hopeless.central
