@@ -320,6 +320,7 @@ mean = [0.0, 0.0, 3.0, 4.0]
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [KEPT, BELIEF])
 def test_ranges_and_bearings_of_pairs_are_those_of_the_extended_kalman_filter(
     tmp_path: Path, settings: dict[str, object]

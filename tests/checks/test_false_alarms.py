@@ -207,6 +207,7 @@ def test_links_too_fast_to_simulate_faster_are_not_refused(tmp_path):
     assert check(scenario_of(RING, tmp_path, **changes), runs=10, workers=1)
 
 
+@pytest.mark.slow
 def test_check_ignores_the_probe_of_the_file(tmp_path, capsys):
     path = str(SCENARIOS / "threshold.toml")
     status = main(["check", path, "--runs", "10", "--workers", "1", "--set", "horizon=0.75",

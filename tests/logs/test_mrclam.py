@@ -143,6 +143,7 @@ def test_the_small_set_is_that_of_its_script_and_the_scenario_that_of_the_set(tm
         assert file.read_text() == (MADE / file.name).read_text(), file.name
 
 
+@pytest.mark.slow
 def test_robots_that_tell_each_other_come_close_to_the_central_filter():
     changes = {"horizon": 9.0}
     scenario = netkf.load(MADE / "scenario.toml", changes)
