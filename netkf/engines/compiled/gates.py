@@ -6,6 +6,7 @@ import numpy as np
 
 from netkf.engines.compiled.slot_messages import SENSE, SlotTimes
 from netkf.engines.compiled.slot_setup import SlotSetup
+from netkf.engines.compiled.slot_steps import step_times
 from netkf.linalg.arrays import IntArray
 from netkf.linalg.lanes import by_run
 from netkf.scenario.scenario import Scenario
@@ -39,6 +40,7 @@ def count_refusals(refused: np.ndarray, counted: np.ndarray, runs: int) -> IntAr
 
 
 def with_refusals(
+    scenario: Scenario,
     setup: SlotSetup,
     times: SlotTimes,
     refused: np.ndarray,
@@ -52,11 +54,8 @@ def with_refusals(
     if not len(slots):
         return rows, before_sample
     read = np.flatnonzero(rows["kind"] == SENSE)
-    stages, now = setup.stages, times.start[slots]
-    if (k := int(np.argmax(stages.step < 0))) > 0:
-        # Sensors are read when the exchange before has ended, as ``make_rows`` says it.
-        ended = np.rint((now + stages.end[k - 1]) * stages.per_second) / stages.per_second
-        now = np.where(times.exchanged[slots], ended, now)
+    read_at = step_times(scenario, setup, times.first, len(times.start)).of_reading(setup)
+    now = read_at[slots]
     # Behind the last reading of this time; slots of other rows have none.
     first, last = (np.searchsorted(rows["t"][read], now, side=side) for side in ("left", "right"))
     known = first < last

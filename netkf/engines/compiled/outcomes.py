@@ -302,12 +302,10 @@ def message_delays(
 
 def draws_in_kernels(network: Network) -> bool:
     """Return True if kernels can draw the outcomes of messages."""
-    # By exact type: a subclass may override the law.
     channel = network.channel
-    if network.radio is not None:
-        return False
+    # By exact type: a subclass may override the law.
     has_known_law = type(channel.loss) in LOSSES and type(channel.delay) in DELAYS
-    return has_known_law and draws_per_link(channel)
+    return has_known_law and network.radio is None and draws_per_link(channel)
 
 
 def delay_is_zero(channel: Channel) -> bool:

@@ -351,12 +351,9 @@ class SlotRuns:
         """Return what happens in the next ``count`` slots, and, if ``timed``, when they begin."""
         setup, algorithm, plant = self.setup, self.setup.algorithm, self._scenario.slot_plant
         slots = np.arange(self._slot, self._slot + count)
-        recorded = slots < setup.last
-        # At the horizon a filter that predicts is only sampled: its prediction is the result.
-        active = recorded | (not algorithm.timing.predicts)
+        recorded, active, exchanged = setup.activity(slots)
         # Filters that do not predict use no reading in slot 0: its sample is their initial state.
         sensed = active & ((slots > 0) | algorithm.timing.predicts)
-        exchanged = active & (slots >= algorithm.timing.first_exchange) & algorithm.timing.talks
         sample = np.full(count, -1, dtype=np.int64)
         first, last = np.searchsorted(setup.samples, (self._slot, self._slot + count))
         # Indices count from the first sample of the run, or of these slots.
@@ -574,9 +571,9 @@ class SlotRuns:
 
     def _silence(self, y: FloatArray, H: FloatArray) -> None:
         """Take away the readings of nodes that are down."""
-        setup, count = self.setup, y.shape[1]
+        setup, times = self.setup, self._step_times(y.shape[1])
         for r, tables in enumerate(self._tables):
-            down = absent(self._scenario, setup, tables.lives, self._slot, count)
+            down = absent(setup, tables.lives, times)
             b, lane = divmod(r, LANES)
             y[b, ..., lane][down] = H[b, ..., lane][down] = 0.0
             for s in setup.nonlinear_sensors:
@@ -708,7 +705,9 @@ class SlotRuns:
         else:
             before_sample = np.zeros(len(block.sampled), dtype=np.int64)
             rows = self._rows(block, 0, len(block.times.start), before_sample)
-        return with_refusals(self.setup, block.times, block.refused, rows, before_sample)
+        return with_refusals(
+            self._scenario, self.setup, block.times, block.refused, rows, before_sample
+        )
 
     def first_events(self, block: SlotBlock) -> Iterator[np.ndarray]:
         """Yield the EVENT rows of the first run of a batch in a block, for some slots at a time."""
@@ -721,7 +720,9 @@ class SlotRuns:
         count = len(block.times.start)
         for first in range(0, count, size):
             rows = self._rows(block, first, min(first + size, count), before_sample)
-            yield with_refusals(self.setup, block.times, block.refused, rows, before_sample)[0]
+            yield with_refusals(
+                self._scenario, self.setup, block.times, block.refused, rows, before_sample
+            )[0]
 
     def _rows(
         self, block: SlotBlock, first: int, stop: int, before_sample: np.ndarray
@@ -743,10 +744,7 @@ class SlotRuns:
         """Add the events of a block to ``self.counts`` (R, KINDS)."""
         setup, times, counts = self.setup, block.times, self.counts
         for r, tables in enumerate(self._tables):
-            # What tables do not know.
-            known = counts[r, [STOP, REFUSE]]
-            counts[r] = tables.counts
-            counts[r, [STOP, REFUSE]] = known
+            counts[r] += tables.take_counts()
         if not self._tables:
             self._count_drawn(block)
         refused = times.recorded & times.sensed

@@ -426,6 +426,15 @@ class SlotSetup:
         )
         return self.has_known_probabilities and network.channel.delay.fixed == 0.0 and exchanges
 
+    def activity(self, slots: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return (S,) bool: whether events of these ``slots`` (S,) are recorded, whether nodes act,
+        and whether they exchange.
+        """
+        timing, recorded = self.algorithm.timing, slots < self.last
+        # At the horizon filters that predict are only sampled: the prediction is the result.
+        acts = recorded | (not timing.predicts)
+        return recorded, acts, acts & timing.talks & (slots >= timing.first_exchange)
+
     @property
     def side_by_side(self) -> bool:
         """True if several runs can be simulated in one call: all make the same steps."""

@@ -46,18 +46,19 @@ class StepTimes(NamedTuple):
             return self.start
         return np.where(self.exchanged, self.end[:, before], self.start)
 
+    def of_reading(self, setup: SlotSetup) -> FloatArray:
+        """Return (S,) when the first readings of the slots are made."""
+        return self.of_stage(setup, int(np.argmax(setup.stages.step < 0)))
+
 
 def step_times(scenario: Scenario, setup: SlotSetup, first: int, count: int) -> StepTimes:
     """Return the times of ``count`` slots."""
-    timing, slots = scenario.node_filter.timing, np.arange(first, first + count)
+    slots = np.arange(first, first + count)
     start = np.array([scenario.slot_plant.slot_time(slot) for slot in slots.tolist()])
     # The ends of steps are counted from the start of the slot.
     end = scenario.time_grid.snap(start[:, None] + setup.stages.end[setup.stages.step >= 0])
     begin = np.concatenate([start[:, None], end[:, :-1]], axis=1)[:, : end.shape[1]]
-    recorded = slots < setup.last
-    # At the horizon filters that predict are only sampled.
-    acts = recorded | (not timing.predicts)
-    exchanged = acts & timing.talks & (slots >= timing.first_exchange)
+    recorded, _, exchanged = setup.activity(slots)
     return StepTimes(first, start, begin, end, exchanged, recorded)
 
 
@@ -70,15 +71,9 @@ def steps_of(scenario: Scenario, setup: SlotSetup, slot: int) -> Iterator[Step]:
             yield Step(step, setup.phases[step], begin, end)
 
 
-def absent(
-    scenario: Scenario, setup: SlotSetup, lives: LifeTable, first: int, count: int
-) -> np.ndarray:
-    """Return (S, N) bool: nodes that are down when the others read, in ``count`` slots from
-    ``first`` on.
-    """
-    reads = int(np.argmax(setup.stages.step < 0))
-    times = step_times(scenario, setup, first, count).of_stage(setup, reads)
-    return lives.is_down(np.arange(len(setup.nodes)), times[:, None])
+def absent(setup: SlotSetup, lives: LifeTable, times: StepTimes) -> np.ndarray:
+    """Return (S, N) bool: nodes that are down when the others read."""
+    return lives.is_down(np.arange(len(setup.nodes)), times.of_reading(setup)[:, None])
 
 
 def slot_restarts(scenario: Scenario, lives: LifeTable) -> dict[int, list[int]]:

@@ -140,6 +140,8 @@ class SlotTables:
     A slot has parts, in this order: the arrivals until it begins, the links that a first sample
     looks at, three for each stage (a reading, or a step of an exchange: who sends, who hears until
     the step ends, who absorbs), and the links that a last sample looks at.
+
+    awake : (S, E, N) flags: nodes that may send, in the slots just made; empty without lives
     """
 
     def __init__(self, scenario: Scenario, streams: Streams, setup: SlotSetup) -> None:
@@ -155,7 +157,7 @@ class SlotTables:
         self.lives, self._lives_passed = life_table(scenario, streams), 0
         # How many changes are recorded.
         self._changes = int(np.searchsorted(self.lives.t, scenario.horizon))
-        self.counts = np.bincount(self.lives.kind[: self._changes], minlength=len(KINDS))
+        self._counts = np.bincount(self.lives.kind[: self._changes], minlength=len(KINDS))
         self.restarts = slot_restarts(scenario, self.lives)
         self._links: list[tuple[int, Any]] = []
         self._part = 0
@@ -172,12 +174,12 @@ class SlotTables:
         self._under_way = NO_MESSAGES
         self._uses: Uses | None = None
         self._rows: list[Rows] = []
-        self._awake = np.zeros((0,) * 3, dtype=np.uint8)
+        self.awake = np.zeros((0,) * 3, dtype=np.uint8)
 
     def _append_link(self, row: Any) -> None:
         if self._part >= 0:
             self._links.append((self._part, row))
-            self.counts[LINK] += 1
+            self._counts[LINK] += 1
 
     def _begin_pairs(self, streams: Streams) -> None:
         setup, activation = self._setup, self._scenario.network.activation
@@ -395,19 +397,14 @@ class SlotTables:
         down = self.lives.is_down(np.arange(len(self._ids)), times.begin[..., None])
         return np.asarray(down & times.exchanged[:, None, None])
 
-    @property
-    def awake(self) -> np.ndarray:
-        """(S, E, N) flags: nodes that may send, in the slots just made; empty without lives."""
-        return self._awake
-
     def _who_sends(self, times: StepTimes, uses: Uses) -> np.ndarray:
         """Return which of the uses (D,) carry a message, unless nodes decide to be silent."""
         setup, sender = self._setup, self._sender[uses.w]
         sends = uses.near & (setup.talks[uses.step, uses.w] == 1)
-        self._awake = np.zeros((0,) * 3, dtype=np.uint8)
+        self.awake = np.zeros((0,) * 3, dtype=np.uint8)
         if self._scenario.network.lives:
             down = self._down(times)
-            self._awake = (~down).astype(np.uint8)
+            self.awake = (~down).astype(np.uint8)
             sends &= ~down[uses.slot, uses.step, sender]
         if setup.may_miss:
             unread = setup.unread(times.first, len(times.start))
@@ -476,7 +473,7 @@ class SlotTables:
         """Count the events of a block of so many ``steps``; messages (K,) when they are sent, if
         they are ``recorded`` (K,): of those that take time all that arrive before the horizon are.
         """
-        counts = self.counts
+        counts = self._counts
         for rows in starts:
             counts[rows.kind] += len(rows.part)
         arrival, lost = messages.arrival, messages.lost
@@ -496,6 +493,14 @@ class SlotTables:
             hears = np.zeros(steps * len(self._ids), dtype=bool)
             hears[self._hearings(messages)[absorbed]] = True
             counts[ABSORB] += int(np.count_nonzero(hears))
+
+    def take_counts(self) -> IntArray:
+        """Return how many events of each kind (KINDS,) came since this was asked for last, but for
+        what filters decide: that they refuse a reading, and stop.
+        """
+        counts = self._counts.copy()
+        self._counts[:] = 0
+        return counts
 
     def _hearings(self, messages: Messages) -> IntArray:
         """Return a number (K,) that messages with one receiver share in a step of a slot."""

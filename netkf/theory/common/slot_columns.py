@@ -22,7 +22,7 @@ from netkf.engines.compiled.life_tables import LifeTable, life_table
 from netkf.engines.compiled.slot_filters import SlotFilters
 from netkf.engines.compiled.slot_loop import WHOLE, SlotSamples
 from netkf.engines.compiled.slot_setup import SlotSetup, slot_setup
-from netkf.engines.compiled.slot_steps import Step, absent, slot_restarts, steps_of
+from netkf.engines.compiled.slot_steps import Step, absent, slot_restarts, step_times, steps_of
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.linalg.lanes import LANES, blocks_of
 from netkf.rng.streams import Streams
@@ -72,7 +72,8 @@ class SlotColumns(ErrorColumns):
         observations = self._all_observations(slot)
         if not len(self._lives.t) and not self._lives.down.any():
             return observations
-        down = absent(self._scenario, self._setup, self._lives, slot, 1)[0]
+        times = step_times(self._scenario, self._setup, slot, 1)
+        down = absent(self._setup, self._lives, times)[0]
         return {h: one for h, one in observations.items() if not down[h]}
 
     def _begin(self) -> SlotFilters:
