@@ -26,5 +26,15 @@ def assert_agree(scenario, replica=0, engine="compiled"):
     return fast
 
 
+def assert_blocks_do_not_matter(scenario, monkeypatch):
+    """A run in slots is the same if fewer slots come in one call of a kernel."""
+    whole = netkf.simulate(scenario, engine="compiled")
+    monkeypatch.setattr("netkf.engines.compiled.slot_setup.BLOCK_BYTES", 1 << 12)
+    parts = netkf.simulate(scenario, engine="compiled")
+    assert parts.fingerprint == whole.fingerprint
+    np.testing.assert_array_equal(parts.P, whole.P)
+    np.testing.assert_array_equal(parts.error, whole.error)
+
+
 def _largest(values):
     return np.nanmax(np.abs(values), initial=0.0, where=np.isfinite(values))

@@ -9,7 +9,7 @@ import pytest
 import netkf
 from netkf.engines.compiled.engine import CompiledEngine
 from tests.algorithms.test_literature import GRAPH, scenario_of
-from tests.engines.agreement import assert_agree
+from tests.engines.agreement import assert_agree, assert_blocks_do_not_matter
 from tests.engines.test_batches import assert_alone
 
 BROADCAST = {"kind": "broadcast"}
@@ -84,12 +84,7 @@ def test_batches_hold_the_single_runs(name, network, tmp_path):
 def test_blocks_of_slots_do_not_matter(name, tmp_path, monkeypatch):
     """A kernel is called for some slots at a time."""
     scenario = made(name, tmp_path, 1, network=network_of("loss"), horizon=30.0)
-    whole = netkf.simulate(scenario, engine="compiled")
-    monkeypatch.setattr("netkf.engines.compiled.slot_setup.BLOCK_BYTES", 1 << 12)
-    parts = netkf.simulate(scenario, engine="compiled")
-    assert parts.fingerprint == whole.fingerprint
-    np.testing.assert_array_equal(parts.P, whole.P)
-    np.testing.assert_array_equal(parts.error, whole.error)
+    assert_blocks_do_not_matter(scenario, monkeypatch)
 
 
 UNSTABLE = {"kind": "linear", "F": [[1.3, 0.2], [0.0, 1.2]], "Q": [[0.1, 0.0], [0.0, 0.2]]}

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-import netkf
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.parts import Delay, Loss
 from tests.algorithms.test_literature import GRAPH, scenario_of
-from tests.engines.agreement import assert_agree
+from tests.engines.agreement import assert_agree, assert_blocks_do_not_matter
 from tests.engines.test_batches import assert_alone
 
 ARROWS = [[0, 1], [1, 2], [2, 0], [3, 2], [2, 4], [4, 3], [1, 3]]
@@ -175,9 +174,4 @@ def test_both_engines_and_batches_make_the_same_runs(seed, tmp_path):
 def test_blocks_of_slots_do_not_matter(seed, tmp_path, monkeypatch):
     """Messages on the way, links that hold their draws and lives go on in the next block."""
     scenario = drawn(seed, tmp_path)
-    whole = netkf.simulate(scenario, engine="compiled")
-    monkeypatch.setattr("netkf.engines.compiled.slot_setup.BLOCK_BYTES", 1 << 12)
-    parts = netkf.simulate(scenario, engine="compiled")
-    assert parts.fingerprint == whole.fingerprint
-    np.testing.assert_array_equal(parts.P, whole.P)
-    np.testing.assert_array_equal(parts.error, whole.error)
+    assert_blocks_do_not_matter(scenario, monkeypatch)

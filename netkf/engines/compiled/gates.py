@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from netkf.engines.compiled.slot_messages import SENSE, SlotTimes
-from netkf.engines.compiled.slot_setup import SlotSetup
+from netkf.engines.compiled.slot_setup import slot_setup
 from netkf.engines.compiled.slot_steps import step_times
 from netkf.linalg.arrays import IntArray
 from netkf.linalg.lanes import by_run
@@ -41,7 +41,6 @@ def count_refusals(refused: np.ndarray, counted: np.ndarray, runs: int) -> IntAr
 
 def with_refusals(
     scenario: Scenario,
-    setup: SlotSetup,
     times: SlotTimes,
     refused: np.ndarray,
     rows: np.ndarray,
@@ -50,7 +49,7 @@ def with_refusals(
     """Return EVENT ``rows`` (K,) of the first run with those of its gates, behind the readings of
     their slots, and the number of rows before each sample, of ``before_sample`` (T,).
     """
-    slots, parts = np.nonzero(refused[0, ..., 0])
+    setup, (slots, parts) = slot_setup(scenario), np.nonzero(refused[0, ..., 0])
     if not len(slots):
         return rows, before_sample
     read = np.flatnonzero(rows["kind"] == SENSE)

@@ -705,9 +705,7 @@ class SlotRuns:
         else:
             before_sample = np.zeros(len(block.sampled), dtype=np.int64)
             rows = self._rows(block, 0, len(block.times.start), before_sample)
-        return with_refusals(
-            self._scenario, self.setup, block.times, block.refused, rows, before_sample
-        )
+        return with_refusals(self._scenario, block.times, block.refused, rows, before_sample)
 
     def first_events(self, block: SlotBlock) -> Iterator[np.ndarray]:
         """Yield the EVENT rows of the first run of a batch in a block, for some slots at a time."""
@@ -720,9 +718,7 @@ class SlotRuns:
         count = len(block.times.start)
         for first in range(0, count, size):
             rows = self._rows(block, first, min(first + size, count), before_sample)
-            yield with_refusals(
-                self._scenario, self.setup, block.times, block.refused, rows, before_sample
-            )[0]
+            yield with_refusals(self._scenario, block.times, block.refused, rows, before_sample)[0]
 
     def _rows(
         self, block: SlotBlock, first: int, stop: int, before_sample: np.ndarray
