@@ -93,7 +93,7 @@ def expected_states(scenario, run, kind, minimise):
 @pytest.mark.one_in(4)
 @pytest.mark.parametrize(("kind", "minimise"), PAIRS)
 def test_the_textbook(kind, minimise, tmp_path):
-    for n in (1, 2, 4):
+    for n in (1, 4):
         scenario = scenario_of(
             {"kind": "track-fusion", "rule": kind, "minimise": minimise}, tmp_path, 1, n
         )

@@ -138,7 +138,8 @@ def test_readings_of_pairs(tmp_path: Path, kind: str, estimates: str, linearise:
     assert_agree(poses(tmp_path, RANGES + SIGHTS, filter__estimates=estimates, **changes))
 
 
-@pytest.mark.parametrize("text", [pytest.param(ROBOTS, marks=pytest.mark.slow), CLOCKED])
+@pytest.mark.slow
+@pytest.mark.parametrize("text", [ROBOTS, CLOCKED])
 def test_kept_cross_covariances(tmp_path: Path, text: str) -> None:
     assert_agree(load(text, tmp_path, filter={"kind": KEPT, "estimates": "own"}))
 

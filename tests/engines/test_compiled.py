@@ -24,7 +24,7 @@ from netkf.rng.streams import Streams
 from netkf.scenario.reading import from_table
 from netkf.trace.recorder import MemorySink, Recorder
 from netkf.trace.schema import EVENT
-from tests.conftest import ANNOUNCE, SCENARIOS, scenario_files
+from tests.conftest import ANNOUNCE, SCENARIOS, scenario_files, with_slow
 from tests.engines.agreement import assert_agree
 
 SHORT = {
@@ -35,8 +35,12 @@ SHORT = {
 }
 
 
-@pytest.mark.one_in(5)
-@pytest.mark.parametrize("file", scenario_files(), ids=lambda file: file.stem)
+LONG = [SCENARIOS / "intel_lab.toml"]
+"""Its event loop is compiled for nothing else."""
+
+
+@pytest.mark.one_in(6)
+@pytest.mark.parametrize("file", with_slow(scenario_files(), LONG), ids=lambda file: file.stem)
 def test_every_scenario_agrees(file):
     scenario = netkf.load(file)
     refusal = CompiledEngine().refusal(scenario)

@@ -666,6 +666,7 @@ def difference(case, reference, run):
     return off, words
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("seed", range(42))
 def test_drawn_cases(seed, tmp_path):
     case = draw(seed)

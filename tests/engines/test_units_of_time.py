@@ -139,7 +139,7 @@ def clocked_cases(draw):
 
 
 @given(clocked_cases(), st.sampled_from(list(UNITS)))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 def test_clocks_in_every_unit(case, name):
     unit = UNITS[name]
     run, other = (netkf.simulate(clocked(u, *case), engine="simpy") for u in (1.0, unit))
@@ -147,7 +147,7 @@ def test_clocks_in_every_unit(case, name):
 
 
 @given(st.sampled_from(SLOTTED), st.integers(1, 5), st.integers(0, 2), st.sampled_from(list(UNITS)))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_slots_in_every_unit(case, steps, delay, name):
     filter_, activation = case
     several = filter_["kind"] != "gossip"

@@ -424,6 +424,7 @@ def test_processes_start_only_where_they_are_worth_it(ring, monkeypatch):
         netkf.monte_carlo(short, 2600)
 
 
+@pytest.mark.slow
 def test_bits_do_not_depend_on_when_processes_start(short, monkeypatch):
     """After so many blocks in this process."""
     alone = netkf.monte_carlo(short, 2600, workers=1)

@@ -86,7 +86,7 @@ def test_each_block_is_driven_by_the_rows_of_its_node(tmp_path, time, engine):
 
 def test_a_plant_of_several_nodes_takes_rows_by_node_and_own_estimates_follow(tmp_path):
     table = team(tmp_path, FLOW, input=RECORDED)
-    table["filter"] = {"kind": "block-intersection", "estimates": "own"}
+    table["filter"] = {"kind": "local", "estimates": "own"}
     table["sensors"] = [table["sensors"][0] | {"nodes": [1, 2], "positions": [[2, 2], [2, 2]]}]
     apart = netkf.simulate(from_table(table, tmp_path), engine="simpy")
     table["plants"] = [table["plants"][0] | {"nodes": [1, 2], "mean": [1.0, 2.0, 0.5]}]

@@ -47,7 +47,7 @@ def test_the_resolved_scenario_gives_the_same_files(finished, tmp_path):
 
 def test_files_that_a_scenario_names_travel_with_it(tmp_path):
     scenario = netkf.load(SCENARIOS / "intel_lab.toml").replace({"horizon": 0.5})
-    out = run_to_directory(scenario, tmp_path / "out").directory
+    out = run_to_directory(scenario, tmp_path / "out", "simpy").directory
     assert (out / "data/intel_lab/connectivity.csv").exists()
     assert netkf.load(out / "scenario.toml").topology.links == scenario.topology.links
 
