@@ -254,9 +254,10 @@ def _check_lives(scenario: DerivedScenario) -> None:
     if not lost:
         return
     kernels, needs = scenario.node_filter.kernels, scenario.node_filter.needs
-    changes = len(scenario.plant.changes) or not scenario.plant.linear
+    changes = len(scenario.followed_changes) or not scenario.plant.linear
+    remembers = kernels is not None and kernels.of(not scenario.slotted).remembers
     rule = remedy = ""
-    if changes and kernels is not None and kernels.of(not scenario.slotted).remembers:
+    if changes and remembers and scenario.node_filter.timing.max_age > 0.0:
         rule = "must be kept where late readings are used and the plant changes or is not linear"
         remedy = 'write "kept", or late = "drop" in [filter]'
     elif needs.memory:

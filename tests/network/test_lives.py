@@ -433,6 +433,54 @@ def test_a_node_that_forgets_begins_with_its_mean_whatever_drives_the_plant(
     np.testing.assert_allclose(run.xhat[at, node], expected, atol=1e-12)
 
 
+LATE = """
+format = 1
+name = "late"
+horizon = 5.0
+probe = [4.0]
+[plant]
+kind = "unknown"
+A = [[-0.5]]
+B = [[0.8]]
+mean = [3.0]
+cov = [[2.0]]
+input = {{ kind = "constant", G = [[1.0]], value = 2.0 }}
+{schedule}
+[[sensors]]
+kind = "recorded"
+nodes = [0]
+path = "y.csv"
+H = [[1.0]]
+R = [[0.3]]
+[network]
+graph = {{ kind = "path", nodes = 2 }}
+activation = {{ kind = "readings" }}
+channel = {{ delay = {{ kind = "constant", seconds = 0.2 }} }}
+lives = [{{ kind = "recorded", nodes = [1], path = "l.csv", memory = "lost" }}]
+[filter]
+kind = "intermittent"
+late = "{late}"
+"""
+
+
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_late_readings_after_a_restart_of_a_driven_plant(tmp_path, engine):
+    (tmp_path / "y.csv").write_text("t,node,y0\n1,0,2.5\n3.6,0,5.5\n")
+    (tmp_path / "l.csv").write_text("t,node,what\n2,1,down\n3.2,1,up\n")
+    (tmp_path / "late.toml").write_text(LATE.format(schedule="", late="exact"))
+    run = netkf.simulate(netkf.load(tmp_path / "late.toml"), engine=engine)
+    x, P, decay = 3.0, 2.0, np.exp(-0.5 * 0.4)
+    for y in (5.5, None):  # from the restart at 3.2 to the reading, and on to 4.0
+        x, P = decay * x + 4.0 * (1.0 - decay), decay**2 * P + 0.64 * (1.0 - decay**2)
+        gain = 0.0 if y is None else P / (P + 0.3)
+        x, P = x + gain * ((y or 0.0) - x), (1.0 - gain) * P
+    np.testing.assert_allclose([run.xhat[0, 1, 0], run.P[0, 1, 0, 0]], [x, P], rtol=1e-12)
+    # What repeats no past may forget, whatever changes.
+    schedule = "schedule = [{ from = 2.0, A = [[-1.0]] }]"
+    (tmp_path / "late.toml").write_text(LATE.format(schedule=schedule, late="drop"))
+    assert netkf.load(tmp_path / "late.toml").forgetful_nodes == (1,)
+
+
 @pytest.mark.one_in(2)
 @pytest.mark.parametrize("engine", ["simpy", "compiled"])
 @pytest.mark.parametrize("slots", [True, False])

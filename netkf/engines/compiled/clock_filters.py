@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -67,6 +68,8 @@ class ClockFilters:
         links = _links_by_receiver(scenario)
         starts = list(zip(start.xhat, start.root, strict=True))
         count, self._common = len(links["sender"]), common_table(scenario)
+        self._begin = partial(scenario.node_filter.kernels.begin, scenario.node_filter)
+        self._believed = list(zip(infos, models, strict=True))
         self.records = make_records(
             scenario.node_filter,
             starts,
@@ -155,9 +158,11 @@ class ClockFilters:
             place = self.records.place(name, h, self.run.first)
             getattr(self.record, name)[place] = getattr(self.start, name)[place]
         if moved.any():
-            self.run.offset[:, 0] = 0.0
-            self.run.offset[: len(moved), 0] = moved
-            call_kernel(self.kernels.shift, self.record, h, run=self.run)
+            # The start itself is elsewhere, also for what remembers its past: no event moved it.
+            known = set(self.records.arrays).difference(self.records.links)
+            views = {name: getattr(self.record, name)[h, ..., 0] for name in known}
+            views["xhat"][: len(moved)] += moved
+            self._begin(views, *self._believed[h])
 
     def begin_piece(self, piece: int) -> None:
         """Let nodes believe the models of a piece of the plant, to whose begin they are
