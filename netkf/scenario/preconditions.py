@@ -99,7 +99,14 @@ def _check_blocks(scenario: DerivedScenario) -> None:
             key = scenario.sensor_key(placed.entry)
             if not knows_blocks or not np.isin(support, view).any():
                 rule = f"must read blocks that node {node} estimates, for the {name}"
-                remedy = 'write filter.estimates = "own+neighbours" or "all"'
+                listed = ", ".join(f'"{name}"' for name in scenario.layout.names)
+                common = any(
+                    place.node in (None, node)
+                    and any(place.first <= entry < place.first + place.n for entry in support)
+                    for place in scenario.layout.places
+                )
+                choice = f"[{listed}]" if common else '"own+neighbours"'
+                remedy = f'write filter.estimates = {choice} or "all"'
                 raise ScenarioError(key, rule, scenario.filter.estimates, remedy)
             sensor = scenario.sensors[placed.entry]
             _check_rows(scenario, k, key, sensor)

@@ -260,6 +260,8 @@ def test_shared_blocks_are_estimated_by_any_filter(tmp_path: Path) -> None:
     text = ROBOTS.replace("[[sensors]]", target + sensor + "[[sensors]]", 1)
     begin, end = text.index('[[sensors]]\nof = "pose"'), text.index("[network]")
     text = text[:begin] + text[end:]
+    with pytest.raises(netkf.ScenarioError, match=r'estimates = \["pose", "target"\] or "all"'):
+        load(text, tmp_path, filter={"kind": "block-intersection", "estimates": "own"})
     shared = {"filter": {"kind": "kcf", "estimates": "shared"}}
     run = netkf.simulate(load(text, tmp_path, **shared))
     alone = text[: text.index("[[plants]]")] + text[text.index(target) :]

@@ -68,7 +68,8 @@ class ClockFilters:
         links = _links_by_receiver(scenario)
         starts = list(zip(start.xhat, start.root, strict=True))
         count, self._common = len(links["sender"]), common_table(scenario)
-        self._begin = partial(scenario.node_filter.kernels.begin, scenario.node_filter)
+        algorithm: Any = scenario.node_filter
+        self._begin = partial(algorithm.kernels.begin, algorithm)
         self._believed = list(zip(infos, models, strict=True))
         self.records = make_records(
             scenario.node_filter,
