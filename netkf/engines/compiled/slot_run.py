@@ -324,7 +324,7 @@ class SlotRuns:
         ends = (slot - self._slot for slot in tables[0].restarts if slot > self._slot)
         count = min([count, *ends]) if setup.forgets else count
         steps = self._step_times(count)
-        arrived = [one.following(steps, with_rows=timed and r == 0) for r, one in enumerate(tables)]
+        arrived = [one.following(steps) for one in tables]
         return self._next_times(count, True), _pack_messages(arrived, [one.awake for one in tables])
 
     def _step_times(self, count: int) -> StepTimes:

@@ -110,7 +110,7 @@ class Messages(NamedTuple):
     number : on its directed link
     sent, arrival, closes : times in seconds; nan if it is lost when it is sent; when the inbox
         closes
-    lost : bool, that its receiver is down when it arrives
+    outcome : the kind of event with which it ends, -1 if that is not recorded
     absorbed : bool, that it is in the inbox when that closes
     """
 
@@ -122,7 +122,7 @@ class Messages(NamedTuple):
     sent: FloatArray
     arrival: FloatArray
     closes: FloatArray
-    lost: np.ndarray
+    outcome: IntArray
     absorbed: np.ndarray
 
     def of(self, chosen: np.ndarray) -> Messages:
@@ -131,7 +131,7 @@ class Messages(NamedTuple):
 
 
 NO_MESSAGES = Messages(*(np.zeros(0, dtype=np.int64),) * 5, *(np.zeros(0),) * 3,
-                       *(np.zeros(0, dtype=bool),) * 2)  # fmt: skip
+                       np.zeros(0, dtype=np.int64), np.zeros(0, dtype=bool))  # fmt: skip
 
 
 class SlotTables:
@@ -173,7 +173,6 @@ class SlotTables:
         self._sent_so_far = np.zeros(len(setup.directions), dtype=np.int64)
         self._under_way = NO_MESSAGES
         self._uses: Uses | None = None
-        self._rows: list[Rows] = []
         self.awake = np.zeros((0,) * 3, dtype=np.uint8)
 
     def _append_link(self, row: Any) -> None:
@@ -236,13 +235,10 @@ class SlotTables:
             asked[:, setup.ends.ravel()] = 1
         return np.asarray(asked * ~self._down(times)[0])
 
-    def following(
-        self, times: StepTimes, decide: Decide | None = None, with_rows: bool = True
-    ) -> np.ndarray:
+    def following(self, times: StepTimes, decide: Decide | None = None) -> np.ndarray:
         """Make the messages of the next slots, with these ``times``; return (S, E, W) which are
         absorbed. If nodes may be silent it is one slot: ``decide(step, up)`` returns who sends,
-        (N,), given ``up`` (E, W) of the steps before. ``with_rows``: ``events`` will be called, in
-        all blocks.
+        (N,), given ``up`` (E, W) of the steps before.
         """
         setup, uses = self._setup, self._uses or self._begin_block(times)
         up = np.zeros((len(times.start), len(setup.fresh), len(setup.directions)), dtype=np.uint8)
@@ -256,13 +252,9 @@ class SlotTables:
                 chosen = sends & (uses.step == step) & (sent[self._sender[uses.w]] != 0)
                 parts.append(self._send(times, uses.of(chosen), up))
             messages = Messages(*map(np.concatenate, zip(*parts, strict=True)))
-        starts = self._rows_of_steps(times, uses)
-        recorded = times.recorded[messages.slot]
-        self._count(starts, messages, recorded, times.begin.size)
-        self._rows = []
-        if with_rows:
-            self._rows = [*starts, *self._rows_of(times, messages, recorded)]
-        self._uses, self._times = None, times
+        self._starts = self._rows_of_steps(times, uses)
+        self._uses, self._times, self._messages = None, times, messages
+        self._count()
         return up
 
     def _begin_block(self, times: StepTimes) -> Uses:
@@ -420,15 +412,20 @@ class SlotTables:
         begin, closes = times.begin[uses.slot, uses.step], times.end[uses.slot, uses.step]
         delay = self._grid.snap(self._delays(uses, number, begin) + self._waits(uses, times))
         arrival, receiver = self._grid.snap(begin + delay), self._receiver[w]
-        lost, absorbed = np.zeros(len(w), dtype=bool), arrival <= closes
+        lost, absorbed = np.isnan(delay), arrival <= closes
+        # Of messages that take time all that arrive before the horizon are recorded.
+        in_time = arrival < self._scenario.horizon
+        is_recorded = np.where(arrival > begin, in_time, times.recorded[uses.slot])
+        outcome = np.where(absorbed, DELIVER, LATE)
         if self._scenario.network.lives:
-            lost = self.lives.is_down(receiver, arrival) & ~np.isnan(arrival)
+            lost |= self.lives.is_down(receiver, arrival)
             # Who goes down before the inbox closes has lost what arrived.
             kept = self.lives.passed(receiver, arrival) == self.lives.passed(receiver, closes)
             absorbed &= kept & ~lost
         here = slice(None) if absorbed.all() else absorbed
         up[uses.slot[here], uses.step[here], w[here]] = 1
-        return Messages(*uses[:4], number, begin, arrival, closes, lost, absorbed)
+        outcome = np.where(is_recorded, np.where(lost, LOST, outcome), -1)
+        return Messages(*uses[:4], number, begin, arrival, closes, outcome, absorbed)
 
     def _delays(self, uses: Uses, number: IntArray, begin: FloatArray) -> FloatArray:
         """Return the seconds (K,) that messages take, nan if lost."""
@@ -467,30 +464,19 @@ class SlotTables:
             waits[own] = self._airtime.waits(node, sizes, begin[own])
         return waits[back]
 
-    def _count(
-        self, starts: list[Rows], messages: Messages, recorded: np.ndarray, steps: int
-    ) -> None:
-        """Count the events of a block of so many ``steps``; messages (K,) when they are sent, if
-        they are ``recorded`` (K,): of those that take time all that arrive before the horizon are.
-        """
-        counts = self._counts
-        for rows in starts:
+    def _count(self) -> None:
+        """Count the events of a block, of messages when they are sent."""
+        counts, messages = self._counts, self._messages
+        for rows in self._starts:
             counts[rows.kind] += len(rows.part)
-        arrival, lost = messages.arrival, messages.lost
-        at_once = arrival == messages.sent
-        later = (arrival < self._scenario.horizon) & ~at_once
-        heard = ((at_once & recorded) | later) & ~lost
-        late = int((heard & (arrival > messages.closes)).sum())
-        gone = recorded & (np.isnan(arrival) | (at_once & lost))
+        recorded, outcome = self._times.recorded[messages.slot], messages.outcome
+        counts += np.bincount(outcome[outcome >= 0], minlength=len(KINDS))
         counts[SEND] += int(recorded.sum())
-        counts[LOST] += int(gone.sum() + (later & lost).sum())
-        counts[LATE] += late
-        counts[DELIVER] += int(heard.sum()) - late
         absorbed = messages.absorbed & recorded
         if self._timing.pairwise:
             counts[SWAP] += int(absorbed.sum())
         else:
-            hears = np.zeros(steps * len(self._ids), dtype=bool)
+            hears = np.zeros(self._times.begin.size * len(self._ids), dtype=bool)
             hears[self._hearings(messages)[absorbed]] = True
             counts[ABSORB] += int(np.count_nonzero(hears))
 
@@ -507,30 +493,41 @@ class SlotTables:
         step = messages.slot * len(self._setup.fresh) + messages.step
         return np.asarray(step * len(self._ids) + self._receiver[messages.w])
 
-    def _rows_of(self, times: StepTimes, messages: Messages, recorded: np.ndarray) -> list[Rows]:
-        """Return the rows of the messages of a block, those that are ``recorded``, and of what
-        happens meanwhile.
-        """
-        kept = messages.of(recorded)
-        sender, receiver = (self._ids[end[kept.w]] for end in (self._sender, self._receiver))
-        part, phase = self._part_of(kept.slot, kept.step), self._phase[kept.step]
+    def _rows_of(self, times: StepTimes, messages: Messages) -> list[Rows]:
+        """Return the rows of the messages of a block, and of what happens meanwhile."""
+        kept = messages.of(times.recorded[messages.slot])
+        part, sender, receiver = self._part_of(kept.slot, kept.step), *self._ends_of(kept)
         # Rows of a message in the order of the pairs, forth before back.
         order = 3 * (kept.w % self._setup.directions_per_link)
-        at: dict[str, Any] = {"group": 2, "place": kept.place, "number": order}
-        sends = Rows(part, kept.sent, SEND, sender, receiver, kept.number, phase, **at)
-        at |= {"number": order + 1}
-        at_once = kept.arrival == kept.sent
-        gone = np.isnan(kept.arrival) | (at_once & kept.lost)
-        lost = Rows(part, kept.sent, LOST, sender, receiver, kept.number, phase, **at)
-        heard = Rows(part, kept.sent, DELIVER, receiver, sender, kept.number, phase, 0.0, **at)
+        sends = Rows(
+            part, kept.sent, SEND, sender, receiver, kept.number, self._phase[kept.step],
+            group=2, place=kept.place, number=order,
+        )  # fmt: skip
+        ended = ~(kept.arrival > kept.sent)
+        at_once = self._rows_of_outcomes(
+            kept.of(ended), part[ended], 2, kept.place[ended], order[ended] + 1
+        )
         links = [
             Rows(np.array([part]), t, kind, i, j, is_up, place=k)
             for k, (part, (t, kind, i, j, is_up, *_)) in enumerate(self._links)
         ]
-        return [
-            *(sends, _chosen(lost, gone), _chosen(heard, at_once & ~kept.lost)),
-            *(self._rows_of_ends(kept, part + 2), *self._rows_between(times, messages), *links),
-        ]
+        rows = self._rows_of_ends(kept, part + 2)
+        return [sends, at_once, rows, *self._rows_between(times, messages), *links]
+
+    def _ends_of(self, messages: Messages) -> tuple[IntArray, IntArray]:
+        """Return the ids of the senders and receivers, (K,) each."""
+        return self._ids[self._sender[messages.w]], self._ids[self._receiver[messages.w]]
+
+    def _rows_of_outcomes(self, ended: Messages, part: IntArray, *order: Any) -> Rows:
+        """Return the rows with which messages end."""
+        sender, receiver = self._ends_of(ended)
+        lost, never = ended.outcome == LOST, np.isnan(ended.arrival)
+        age = self._grid.snap(ended.arrival - ended.sent)
+        return Rows(
+            part, np.where(never, ended.sent, ended.arrival), ended.outcome,
+            np.where(lost, sender, receiver), np.where(lost, receiver, sender), ended.number,
+            self._phase[ended.step], np.where(lost, NAN, age), *order,
+        )  # fmt: skip
 
     def _rows_of_steps(self, times: StepTimes, uses: Uses) -> list[Rows]:
         """Return the rows of readings, and those with which the steps of exchanges begin."""
@@ -580,26 +577,17 @@ class SlotTables:
             phase=self._phase[here.step[first]], age=oldest, place=self._ids[node[first]],
         )  # fmt: skip
 
-    def _rows_between(self, times: StepTimes, messages: Messages) -> tuple[Rows, Rows, Rows]:
+    def _rows_between(self, times: StepTimes, messages: Messages) -> tuple[Rows, Rows]:
         """Return the rows of messages that took time and of nodes that went up or down, until the
         last moment of the block; keep the messages that are still under way.
         """
         until, part = self._ends_of_parts(times)
-        taken = messages.arrival > messages.sent
-        # Nothing is recorded from the horizon on.
-        new = messages.of(taken & (messages.arrival < self._scenario.horizon))
+        new = messages.of((messages.arrival > messages.sent) & (messages.outcome >= 0))
         under_way = Messages(*map(np.concatenate, zip(self._under_way, new, strict=True)))
         at = np.searchsorted(until, under_way.arrival)
         self._under_way = under_way.of(at == len(until))
         here, part_of = under_way.of(at < len(until)), part[at[at < len(until)]]
-        sender, receiver = (self._ids[end[here.w]] for end in (self._sender, self._receiver))
-        order: dict[str, Any] = {"group": 1, "place": here.w, "number": here.number}
-        phase, age = self._phase[here.step], self._grid.snap(here.arrival - here.sent)
-        lost = Rows(part_of, here.arrival, LOST, sender, receiver, here.number, phase, **order)
-        kind = np.where(here.arrival <= here.closes, DELIVER, LATE)
-        heard = Rows(
-            part_of, here.arrival, kind, receiver, sender, here.number, phase, age, **order
-        )
+        ended = self._rows_of_outcomes(here, part_of, 1, here.w, here.number)
         lives, first = self.lives, self._lives_passed
         self._lives_passed = int(np.searchsorted(lives.t[: self._changes], until[-1], "right"))
         span = slice(first, self._lives_passed)
@@ -607,7 +595,7 @@ class SlotTables:
             part[np.searchsorted(until, lives.t[span])], lives.t[span], lives.kind[span],
             self._ids[lives.node[span]], place=lives.node[span],
         )  # fmt: skip
-        return _chosen(lost, here.lost), _chosen(heard, ~here.lost), changes
+        return ended, changes
 
     def _ends_of_parts(self, times: StepTimes) -> tuple[FloatArray, IntArray]:
         """Return when the parts end in which messages arrive, and which parts these are, (P,)."""
@@ -631,7 +619,7 @@ class SlotTables:
         before the samples of the slots with indices ``sampled``, (T,). ``stopped`` (N,): the slot
         in which each node stops.
         """
-        groups = self._rows
+        groups = [*self._starts, *self._rows_of(self._times, self._messages)]
         if self._setup.stages.stopping >= 0:
             groups = [*groups, self._stops(stopped - self._times.first, self._times)]
         columns = [_whole(rows) for rows in groups]
