@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -11,17 +10,6 @@ from netkf.engines.compiled.life_tables import LifeTable
 from netkf.engines.compiled.slot_setup import SlotSetup
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-
-
-class Step(NamedTuple):
-    """One step of an exchange: the number of the ``step`` in its slot, its ``phase``, and its times
-    in seconds.
-    """
-
-    step: int
-    phase: int
-    begin: float
-    end: float
 
 
 class StepTimes(NamedTuple):
@@ -60,15 +48,6 @@ def step_times(scenario: Scenario, setup: SlotSetup, first: int, count: int) -> 
     begin = np.concatenate([start[:, None], end[:, :-1]], axis=1)[:, : end.shape[1]]
     recorded, _, exchanged = setup.activity(slots)
     return StepTimes(first, start, begin, end, exchanged, recorded)
-
-
-def steps_of(scenario: Scenario, setup: SlotSetup, slot: int) -> Iterator[Step]:
-    """Yield the steps of the exchanges of a slot."""
-    times = step_times(scenario, setup, slot, 1)
-    if times.exchanged[0]:
-        ends = zip(times.begin[0].tolist(), times.end[0].tolist(), strict=True)
-        for step, (begin, end) in enumerate(ends):
-            yield Step(step, setup.phases[step], begin, end)
 
 
 def absent(setup: SlotSetup, lives: LifeTable, times: StepTimes) -> np.ndarray:

@@ -22,7 +22,7 @@ from netkf.engines.compiled.life_tables import LifeTable, life_table
 from netkf.engines.compiled.slot_filters import SlotFilters
 from netkf.engines.compiled.slot_loop import WHOLE, SlotSamples
 from netkf.engines.compiled.slot_setup import SlotSetup, slot_setup
-from netkf.engines.compiled.slot_steps import Step, absent, slot_restarts, step_times, steps_of
+from netkf.engines.compiled.slot_steps import absent, slot_restarts, step_times
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.linalg.lanes import LANES, blocks_of
 from netkf.rng.streams import Streams
@@ -181,9 +181,7 @@ class SlotColumns(ErrorColumns):
         shape, sent = (blocks, 1, *up.shape, LANES), np.zeros((0,) * 5, dtype=np.uint8)
         if self._scenario.network.lives:
             # Who is down gives nothing away.
-            begins = np.zeros(steps)
-            for one in steps_of(self._scenario, setup, slot):
-                begins[one.step] = one.begin
+            begins = step_times(self._scenario, setup, slot, 1).begin[0]
             asleep = [self._lives.is_down(h, begins) for h in range(setup.estimators)]
             sent = np.zeros((blocks, 1, steps, setup.estimators, LANES), dtype=np.uint8)
             sent[:] = ~np.array(asleep).T[:, :, None]
@@ -292,16 +290,15 @@ def _arrivals(
     slots, phases = scenario.slot_plant.slots_of(sends["t"]), np.maximum(sends["phase"], 0)
     first_step = {phase: setup.phases.index(phase) for phase in set(setup.phases)}
     counts: dict[tuple[int, int, int], int] = {}
-    steps: dict[int, list[Step]] = {}
-    if len(lives.t):
-        steps = {k: list(steps_of(scenario, setup, k)) for k in np.unique(slots).tolist()}
+    times = step_times(scenario, setup, 0, setup.slots) if len(lives.t) else None
+    phase_of_step = np.array(setup.phases, dtype=np.int64)
     places: dict[tuple[int, int], tuple[int, int]] = {}
     columns = (slots, phases, *(sends[name] for name in ("node", "peer", "message", "t")))
     for slot, phase, node, peer, number, t in zip(*(c.tolist() for c in columns), strict=True):
         w = index[node, peer]
-        if slot in steps:
+        if times is not None:
             # Who was down in a repetition did not send in it.
-            passed = sum(one.phase == phase and one.begin < t for one in steps[slot])
+            passed = int(((phase_of_step == phase) & (times.begin[slot] < t)).sum())
             counts[slot, phase, w] = max(counts.get((slot, phase, w), 0), passed)
         # A link sends once in each repetition of an exchange.
         step = counts.get((slot, phase, w), 0)
@@ -314,10 +311,10 @@ def _arrivals(
     for t, node, peer, number in zip(*(c.tolist() for c in columns), strict=True):
         w = index[peer, node]
         slot, step = places[w, number]
-        if slot in steps:
+        if times is not None:
             # Who goes down before the step ends has lost what arrived.
             changes = lives.t[lives.node == nodes[node]]
-            if ((changes > t) & (changes <= steps[slot][step].end)).any():
+            if ((changes > t) & (changes <= times.end[slot, step])).any():
                 continue
         arrivals.setdefault(slot, np.zeros(shape, dtype=np.uint8))[step, w] = 1
     return arrivals
