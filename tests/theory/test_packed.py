@@ -12,6 +12,7 @@ from netkf.theory.hybrid import bounds, coupled, dense, linearised, steady
 from netkf.theory.hybrid.coupled import CoupledRiccati
 from netkf.theory.hybrid.packed import PackedRiccati
 from netkf.theory.hybrid.samples import PoissonSamples
+from netkf.theory.numerics import matrices
 
 N, n = 5, 3
 
@@ -230,12 +231,12 @@ def test_bounds_and_limits_of_few_nodes_are_those_of_sparse_matrices(build, both
 def test_riccati_equations_of_few_states_have_the_solutions_of_scipy():
     for seed in range(24):
         random = np.random.default_rng(seed)
-        size = 1 + seed % dense.MAX_STATES
+        size = 1 + seed % matrices.MAX_STATES
         A, B, C = (random.normal(size=(size, size)) for _ in range(3))
         A[0] *= 10.0 ** (seed % 3)  # states in units of their own
         Q, G = B @ B.T, C[:1].T @ C[:1]
         expected = scipy.linalg.solve_continuous_are(A.T, C[:1].T, Q, np.eye(1))
-        got = dense.steady_riccati(A, Q, G)
+        got = matrices.algebraic_riccati(A, Q, G)
         terms = np.abs(A @ got).max() + np.abs(got @ G @ got).max()
         assert np.abs(A @ got + got @ A.T + Q - got @ G @ got).max() <= 1e-11 * terms
         near(got, expected, 1e-7)

@@ -15,7 +15,7 @@ from netkf.theory.hybrid.coupled import (
     left_weights,
     require_bound,
 )
-from netkf.theory.hybrid.dense import full_matrix, steady_riccati
+from netkf.theory.hybrid.dense import full_matrix
 from netkf.theory.hybrid.samples import (
     PoissonSamples,
     poisson_samples,
@@ -24,7 +24,7 @@ from netkf.theory.hybrid.samples import (
 )
 from netkf.theory.hybrid.steady import steady_state
 from netkf.theory.intermittent.riccati import filtered_covariance
-from netkf.theory.numerics.matrices import lyapunov
+from netkf.theory.numerics.matrices import algebraic_riccati, lyapunov
 
 
 def limit_covariance(scenario: Scenario) -> FloatArray:
@@ -42,7 +42,7 @@ def limit_covariance(scenario: Scenario) -> FloatArray:
     w = left_weights(scenario)
     G = np.tensordot(w, increment_informations(scenario), 1)
     if not scenario.sampled_sensors:
-        return steady_riccati(A, Q, G)
+        return algebraic_riccati(A, Q, G)
     require_bound(scenario)
     if sample_jumps(scenario):
         raise TheoryError("samples at known times lead to a cycle, not to a limit S")
@@ -140,7 +140,7 @@ def central_covariance(scenario: Scenario) -> FloatArray:
     for node in scenario.sensing_nodes:
         H, R = scenario.observation_matrices(node)
         G += H.T @ np.linalg.solve(R, H)
-    return steady_riccati(scenario.diffusion.A, scenario.diffusion.Q, G)
+    return algebraic_riccati(scenario.diffusion.A, scenario.diffusion.Q, G)
 
 
 def _central_slot_covariance(scenario: Scenario) -> FloatArray:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from typing import Any
+
 import numpy as np
 import scipy
 
@@ -12,6 +15,9 @@ from netkf.linalg.arrays import ArrayLike, FloatArray, is_semidefinite, square_r
 from netkf.linalg.spectra import RATE, growth_rate, hidden_mode, outputs_of
 
 RESIDUAL = 1e-9  # of an equation, relative to its terms: larger ones mean a failed solver
+ROUNDING, NEWTON_STEPS = 1e-13, 4  # of a Riccati equation: what ends refinement, and when it must
+MAX_STATES = 6
+"""States up to which equations are solved by numpy alone: to import scipy.linalg takes longer."""
 
 
 def as_numbers(name: str, value: ArrayLike) -> FloatArray:
@@ -93,19 +99,32 @@ def algebraic_riccati(A: FloatArray, Q: FloatArray, G: FloatArray) -> FloatArray
         raise TheoryError(
             f"(A, H) is not detectable: the mode with eigenvalue {hidden:.6g} is not seen"
         )
+    if len(A) <= MAX_STATES:
+        with suppress(np.linalg.LinAlgError, TheoryError):
+            # S = V U^-1 for the stable eigenvectors (U, V) of the Hamiltonian matrix.
+            values, vectors = np.linalg.eig(np.block([[A.T, -G], [-Q, -A]]))
+            U, V = np.split(vectors[:, values.real < 0.0], 2)
+            # LinAlgError unless there are n of them.
+            return _refined(A, Q, G, np.linalg.solve(U.T, V.T).real)
     try:
-        S = scipy.linalg.solve_continuous_are(A.T, square_root(G), Q, np.eye(len(A)))
+        S: Any = scipy.linalg.solve_continuous_are(A.T, square_root(G), Q, np.eye(len(A)))
     except (np.linalg.LinAlgError, ValueError) as error:
         raise TheoryError(f"no stabilising solution of the Riccati equation: {error}") from None
-    # One step of Newton's method (Kleinman) removes the rounding error of the solver:
-    # 0 = (A - S G) S+ + S+ (A - S G)' + Q + S G S.
-    closed = A - S @ G
-    S = _solve_lyapunov(closed, Q + S @ G @ S)
-    # The solver does not report an inaccurate or a wrong solution: check residual and stability.
-    residual = A @ S + S @ A.T + Q - S @ G @ S
-    size = np.abs(A @ S).max() + np.abs(Q).max() + np.abs(S @ G @ S).max()
-    if not np.abs(residual).max() <= RESIDUAL * size:
-        raise TheoryError(f"the Riccati equation was solved to {np.abs(residual).max():.1e} only")
+    return _refined(A, Q, G, S)
+
+
+def _refined(A: FloatArray, Q: FloatArray, G: FloatArray, S: FloatArray) -> FloatArray:
+    """Return a solution of ``algebraic_riccati`` without the rounding errors of its solver."""
+    for _ in range(NEWTON_STEPS):
+        # Newton's method (Kleinman): 0 = (A - S G) S+ + S+ (A - S G)' + Q + S G S.
+        S = _solve_lyapunov(A - S @ G, Q + S @ G @ S)
+        # The solver does not report an inaccurate or a wrong solution.
+        residual = np.abs(A @ S + S @ A.T + Q - S @ G @ S).max()
+        size = np.abs(A @ S).max() + np.abs(Q).max() + np.abs(S @ G @ S).max()
+        if residual <= ROUNDING * size:
+            break
+    if not residual <= RESIDUAL * size:
+        raise TheoryError(f"the Riccati equation was solved to {residual:.1e} only")
     if not growth_rate(A - S @ G) < 0.0:
         raise TheoryError("the solution found does not stabilise the filter")
     return S
@@ -124,7 +143,12 @@ def lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
 
 def _solve_lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
     """Return symmetric X (n, n) with ``A X + X A' = -Q`` for A and Q (n, n)."""
-    return symmetric(np.asarray(scipy.linalg.solve_continuous_lyapunov(A, -Q), dtype=np.float64))
+    n, eye = len(A), np.eye(len(A))
+    if n > MAX_STATES:
+        X = scipy.linalg.solve_continuous_lyapunov(A, -Q)
+    else:
+        X = np.linalg.solve(np.kron(A, eye) + np.kron(eye, A), -Q.reshape(-1)).reshape(n, n)
+    return symmetric(np.asarray(X, dtype=np.float64))
 
 
 def undetectable_mode(A: FloatArray, G: FloatArray) -> complex | None:
