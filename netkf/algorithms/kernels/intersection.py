@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from netkf.algorithms.kernels.square_root import NEGLIGIBLE
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import Lanes, load, magnitude, root_of, select, spread, store, with_sign
@@ -19,8 +20,7 @@ SINGULAR = 2.0**-25
 """Least pivot of a root that is inverted, relative to the length of its row: the square root of
 2^-50, at which a pivot of the covariance itself would be rounding.
 """
-NEGLIGIBLE = 1e-40  # share of a squared pivot that changes neither it nor the rows below it
-TINY = 1e-200  # the same for a pivot of 0, yet above underflow
+TINY = 1e-200  # what NEGLIGIBLE is for a pivot of 0, yet above underflow
 
 
 @kernel(inlined=True, fused=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from netkf.algorithms.kernels.run import carry, use_reading
-from netkf.algorithms.kernels.square_root import triangularise
+from netkf.algorithms.kernels.square_root import absorb_columns
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import load, load_flags, root_of, select, spread, store
 
@@ -44,16 +44,13 @@ def combine_convex(record: Any, h: int, run: Any) -> None:
         arrived = load_flags(lanes, run.arrived, k)
         weight = select(arrived, run.message_weight[k], 0.0)
         factor = root_of(weight)
-        # P + w P_j = A A' with A = [S, sqrt(w) S_j], made triangular by reflections.
+        # P + w P_j = A A' with A = [S, sqrt(w) S_j].
         for i in range(n):
-            for j in range(n):
-                store(lanes, run.moved, i, j, 0.0)
             for j in range(i + 1):
-                store(lanes, run.moved, i, j, load(lanes, root, h, i, j))
                 store(lanes, run.noise, i, j, factor * load(lanes, payload.root, m, i, j))
             difference = load(lanes, payload.xhat, m, i) - load(lanes, record.xhat, h, i)
             store(lanes, run.moved_mean, i, load(lanes, run.moved_mean, i) + weight * difference)
-        triangularise(lanes, run.size, root[h], run.moved, run.noise)
+        absorb_columns(lanes, run.size, root[h], run.noise)
     for i in range(n):
         mean = load(lanes, record.xhat, h, i) + load(lanes, run.moved_mean, i)
         store(lanes, record.xhat, h, i, mean)

@@ -16,8 +16,8 @@ from __future__ import annotations
 
 import math
 
-from netkf.algorithms.kernels.intersection import NEGLIGIBLE, SINGULAR, TINY
-from netkf.algorithms.kernels.square_root import triangularise
+from netkf.algorithms.kernels.intersection import SINGULAR, TINY
+from netkf.algorithms.kernels.square_root import NEGLIGIBLE, triangularise
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import ONE

@@ -17,6 +17,7 @@ from netkf.linalg.lanes import Lanes, load, magnitude, root_of, select, spread, 
 from netkf.linalg.structs import Size
 
 TINY = 1e-300  # below any squared length of a row that counts, yet above underflow
+NEGLIGIBLE = 1e-40  # share of a squared pivot that changes neither it nor the rows below it
 
 
 def lower_triangular(array: FloatArray) -> FloatArray:
@@ -133,3 +134,19 @@ def triangularise(lanes: Lanes, size: Size, S: FloatArray, wide: FloatArray, T: 
         reflect_row(lanes, size, i, n, wide, T, square, square > TINY)
         for j in range(i + 1):
             store(lanes, S, i, j, load(lanes, wide, i, j))
+
+
+@kernel(inlined=True, fused=True)
+def absorb_columns(lanes: Lanes, size: Size, S: FloatArray, wide: FloatArray) -> None:
+    """Replace S (n, n, L) by the lower triangular root of ``S S' + wide wide'`` in each of L lanes
+    (runs side by side); both are lower triangular, and ``wide`` (n, n, L) is overwritten.
+    """
+    # [S, wide] is made lower triangular from the right, row by row.
+    for i in range(len(size)):
+        pivot, below = load(lanes, S, i, i), spread(lanes, 0.0)
+        for j in range(i + 1):
+            below += load(lanes, wide, i, j) * load(lanes, wide, i, j)
+        square = pivot * pivot
+        # Reflect column i of S and the columns of ``wide`` that are not 0 in row i.
+        active = below > NEGLIGIBLE * square + TINY
+        reflect_row(lanes, size, i, i + 1, S, wide, square + below, active)

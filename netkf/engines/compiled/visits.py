@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from netkf.algorithms.kernels.intersection import NEGLIGIBLE, TINY
 from netkf.algorithms.kernels.root_flow import (
     cell_of,
     cholesky_in_lanes,
@@ -30,7 +29,7 @@ from netkf.algorithms.kernels.root_flow import (
     use_moments,
     width_of,
 )
-from netkf.algorithms.kernels.square_root import reflect_row
+from netkf.algorithms.kernels.square_root import absorb_columns
 from netkf.engines.compiled.events import store_sample
 from netkf.engines.compiled.increments import advance_over_interval, next_interval, noise_index
 from netkf.engines.compiled.lane_readings import (
@@ -52,19 +51,17 @@ from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import (
     LANES,
     MANY,
-    Lanes,
     gather,
     load,
     prefetch,
     scatter,
-    spread,
     store,
     turn,
     with_spare,
 )
 from netkf.linalg.local import local_lanes_matrix, local_lanes_vector
 from netkf.linalg.series import fill_row
-from netkf.linalg.structs import Size, Struct
+from netkf.linalg.structs import Struct
 
 MAX_VISITS = 1 << 14
 """Length of the queue of visits, so that it fits the processor's cache."""
@@ -728,19 +725,3 @@ def combine_lanes(
     for i in range(n):
         for j in range(i + 1):
             store(MANY, visits.V, i, j, load(MANY, total, i, j))
-
-
-@kernel(inlined=True, fused=True)
-def absorb_columns(lanes: Lanes, size: Size, S: FloatArray, wide: FloatArray) -> None:
-    """Replace S (n, n, L) by the lower triangular root of ``S S' + wide wide'`` in each of L lanes
-    (runs side by side); both are lower triangular, and ``wide`` (n, n, L) is overwritten.
-    """
-    # [S, wide] is made lower triangular from the right, row by row.
-    for i in range(len(size)):
-        pivot, below = load(lanes, S, i, i), spread(lanes, 0.0)
-        for j in range(i + 1):
-            below += load(lanes, wide, i, j) * load(lanes, wide, i, j)
-        square = pivot * pivot
-        # Reflect column i of S and the columns of ``wide`` that are not 0 in row i.
-        active = below > NEGLIGIBLE * square + TINY
-        reflect_row(lanes, size, i, i + 1, S, wide, square + below, active)
