@@ -269,15 +269,22 @@ def meet(record: Any, h: int, run: Any, k: int, q: int) -> None:
         multiply(record.part, record.inverse_j, True, C)
     copy_matrix(record.L, A)
     multiply(record.moved, record.L, False, A)
-    for i in range(n):
-        for j in range(n):
-            record.base[w, i, j, q], record.last[w, i, j, q] = A[i, j], record.moved[i, j]
-        for j in range(v):
-            record.core[w, i, j, q], record.seen[w, i, j, q] = C[i, j], seen[i, j]
+    keep_factors(record, w, q)
     now = run.now if run.slot < 0 else float(run.slot * record.steps + run.step)
     record.since[w, q], record.when[w, q] = since, now
     if usable:
         hear(record, h, run, k, q)
+
+
+@kernel
+def keep_factors(record: Any, w: int, q: int) -> None:
+    """Keep the factors A and C of link ``w``, and what has moved them since."""
+    for i in range(len(record.A)):
+        for j in range(len(record.A)):
+            record.base[w, i, j, q], record.last[w, i, j, q] = record.A[i, j], record.moved[i, j]
+        for j in range(len(record.A_j)):
+            record.core[w, i, j, q] = record.C[i, j]
+            record.seen[w, i, j, q] = record.seen_now[i, j]
 
 
 @kernel

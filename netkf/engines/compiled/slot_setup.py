@@ -38,7 +38,6 @@ from netkf.network.deliveries import Deliveries, DeliveringLoss
 from netkf.network.graphs import Link
 from netkf.network.losses import GilbertElliott, identical_per_link
 from netkf.network.matchings import PROTOCOLS, Broadcast, Matching, maximal_matchings
-from netkf.plants.recorded import RecordedSensor
 from netkf.plants.regressors import RegressorSensor
 from netkf.plants.slot_paths import SlotSensors
 from netkf.plants.transitions import frame_slots
@@ -162,27 +161,7 @@ class SlotSetup:
             self.pairs = SlotPairs(scenario, self.columns)
             rows = self._set_pairs(self.pairs, scenario)
         self.rows, self.p = rows, max(self.p, int(rows.max(initial=1)))
-        # Python reads recorded sensors and those of users, kernels read the others; some of these
-        # have regressors as H.
-        self.recorded_sensors: list[AssignedSensor] = []
-        self.own_sensors: list[AssignedSensor] = []
-        self.kernel_sensors: list[AssignedSensor] = []
-        self.regressor_sensors: list[AssignedSensor] = []
-        self.nonlinear_sensors: list[AssignedSensor] = []
-        for assigned in self.assigned:
-            sensor = scenario.sensors[assigned.placed_sensor.entry]
-            if not sensor.linear:
-                self.nonlinear_sensors.append(assigned)
-                recorded = sensor.record is not None
-                (self.recorded_sensors if recorded else self.kernel_sensors).append(assigned)
-            elif is_own(sensor):
-                self.own_sensors.append(assigned)
-            elif isinstance(sensor, RecordedSensor):
-                self.recorded_sensors.append(assigned)
-            else:
-                self.kernel_sensors.append(assigned)
-                if isinstance(sensor, RegressorSensor):
-                    self.regressor_sensors.append(assigned)
+        self._sort_sensors(scenario)
         linear = not self.regressor_sensors and not self.nonlinear_sensors
         all_fixed = len(self.kernel_sensors) == len(self.assigned) and linear
         self.gate: Gate | None = scenario.filter.gate
@@ -192,6 +171,17 @@ class SlotSetup:
         self.H: FloatArray = aligned((1, 1, self.estimators, self.p, self.columns.width, LANES))
         self._set_nonlinear_rows(scenario)
         self._set_kernel_sensors(scenario)
+
+    def _sort_sensors(self, scenario: Scenario) -> None:
+        # Python reads recorded sensors and those of users, kernels read the others; some of these
+        # have regressors as H.
+        sensors = [(s, scenario.sensors[s.placed_sensor.entry]) for s in self.assigned]
+        others = [(s, one) for s, one in sensors if not one.linear or not is_own(one)]
+        self.nonlinear_sensors = [s for s, one in others if not one.linear]
+        self.own_sensors = [s for s, one in sensors if one.linear and is_own(one)]
+        self.recorded_sensors = [s for s, one in others if one.record is not None]
+        self.kernel_sensors = [s for s, one in others if one.record is None]
+        self.regressor_sensors = [s for s, one in others if isinstance(one, RegressorSensor)]
 
     @cached_property
     def gated_parts(self) -> list[list[tuple[int, int]]]:

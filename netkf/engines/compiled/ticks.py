@@ -513,9 +513,9 @@ class Schedule:
         if scenario.links_move and listed is not None:
             self._moving = moving_links(scenario, senders, listed, truth, lives.is_down)
         delivery, outcomes = np.ones((2, len(senders.directions))), []
-        if senders.entities and draws_in_kernels(scenario.network) and self._moving is None:
+        if draws_in_kernels(scenario.network) and self._moving is None:
             delivery = _delivery(scenario)
-        elif senders.entities and listed is not None:
+        elif listed is not None:
             heard = self._moving
             if scenario.network.lives and heard is None:
                 heard = links_of_lives(senders, listed, lives, scenario.topology.index)
