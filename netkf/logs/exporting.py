@@ -143,8 +143,9 @@ def export_log(run: Run, out: str | Path) -> tuple[Path, ...]:
     """Write a run as a packet log into the new folder ``out``; return the paths.
 
     ``packets.csv`` has a row for each message: t, sender, receiver, number (of its direction),
-    heard (0 or 1) and t_heard, which is inf for a message under way at the end. ``scenario.toml``
-    and its tables are those of the run; ``ticks.csv`` are the ticks of its clocks.
+    heard (0 or 1) and t_heard, which is inf for a message under way at the end; one that is not
+    heard has it if it came to a node that was down. ``scenario.toml`` and its tables are those of
+    the run; ``ticks.csv`` are the ticks of its clocks, unless nodes have wrong ones.
     ``netkf.import_log(out, "csv", ...)`` makes of it a scenario whose run with the same seed and
     replica has the same events and states.
 
@@ -158,6 +159,7 @@ def export_log(run: Run, out: str | Path) -> tuple[Path, ...]:
     names = {int(node): str(node) for node in scenario.nodes}
     outcome = messages["outcome"]
     arrivals = np.where(outcome == UNDER_WAY, np.inf, messages["ended"])
+    never = (outcome == LOST) & (messages["ended"] == messages["sent"])
     table = pd.DataFrame(
         {
             "t": messages["sent"],
@@ -166,15 +168,15 @@ def export_log(run: Run, out: str | Path) -> tuple[Path, ...]:
             "number": messages["number"],
             "heard": (outcome != LOST).astype(int),
             "t_heard": [
-                "" if lost else repr(t)
-                for lost, t in zip(outcome == LOST, arrivals.tolist(), strict=True)
+                "" if lost else repr(t) for lost, t in zip(never, arrivals.tolist(), strict=True)
             ],
         }
     )
     source = f"# netkf: seed {run.seed}, replica {run.replica}, engine {run.engine}\n"
     files: Files = {"packets.csv": source + table.to_csv(index=False)}
     activation = scenario.network.activation
-    if isinstance(activation, LinkClock) and activation.at != "readings":
+    own_clocks = isinstance(activation, LinkClock) and activation.at != "readings"
+    if own_clocks and not scenario.network.clocks:
         rows = run.log[run.log["kind"] == CODES["tick"]]
         stamps = [scenario.time.stamps.text(t) for t in rows["t"].tolist()]
         ticks = pd.DataFrame({"t": stamps, "node": [names[i] for i in rows["node"].tolist()]})

@@ -89,6 +89,10 @@ def write_network(
     if outcomes.empty:
         raise ScenarioError(name, "has no packet that anybody could hear", None, "check the log")
     account = accounts(log.sends, outcomes)
+    if like is not None and like.network.lives:
+        # What comes to a node that is down is lost by its life, at that instant.
+        came = (outcomes["heard"] == 0.0) & outcomes["delay"].notna()
+        outcomes = outcomes.assign(heard=outcomes["heard"].mask(came, 1.0))
     table, unknown = _outcome_tables(log, outcomes)
     files: Files = {
         "outcomes.csv": table.to_csv(index=False),
@@ -100,7 +104,9 @@ def write_network(
         "loss": {"kind": "recorded", "path": "outcomes.csv", "after": "lose"},
         "symmetric": False,
     }
-    delays = table[table["delay"] > 0.0][["sender", "receiver", "message", "delay"]]
+    delays = table[(table["delay"] > 0.0) & (table["delivered"] == 1)][
+        ["sender", "receiver", "message", "delay"]
+    ]
     if len(delays):
         files["delays.csv"] = delays.rename(columns={"delay": "seconds"}).to_csv(index=False)
         channel["delay"] = {"kind": "recorded", "path": "delays.csv"}
@@ -279,6 +285,11 @@ def _scenario_like(
     resolved = resolve_defaults(scenario)
     network = resolved["network"]
     network["channel"] = {**channel, "symmetric": scenario.network.channel.symmetric}
+    timed = {"bits_per_second", "queue"}.intersection(network.get("radio", ()))
+    if "delay" in channel and timed:
+        # Frames may be counted all the same, as packets of so many joules.
+        network["radio"] = {k: v for k, v in network["radio"].items() if k not in timed}
+        log.notes.append("not used: the rate of network.radio: times of arrival in the log have it")
     activation, files = scenario.network.activation, Files()
     replaced = source_files(scenario.network.channel)
     found = _recorded_activation(scenario, log)
@@ -338,6 +349,8 @@ def _recorded_activation(
         return table, rows.drop_duplicates().to_csv(index=False)
     if not isinstance(activation, LinkClock) or isinstance(activation, OnReadings):
         return None
+    if log.is_run and scenario.network.clocks:
+        return None  # It ticks again by the clocks of its nodes.
     at, is_broadcast = activation.at, bool((sends["to"] == "").any())
     if log.ticks is None and is_broadcast != (at == "nodes"):
         at = "nodes" if is_broadcast else "directions"

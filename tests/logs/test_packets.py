@@ -301,6 +301,34 @@ def test_a_run_written_as_a_log_comes_back_to_the_bit(name, tmp_path):
     np.testing.assert_array_equal(run.P, replay.P)
 
 
+CAUSES = {
+    "lives": {"lives": [{"kind": "crashes", "nodes": [1], "mean_up": 2.0, "mean_down": 1.0}]},
+    "radio": {"radio": {"bits_per_second": 2000.0, "frame_bytes": 20}},
+    "clocks": {"clocks": [{"nodes": [0], "offset": 0.05, "drift": -1e-3}]},
+}
+
+
+@pytest.mark.parametrize("cause", CAUSES)
+def test_a_log_counts_a_cause_once(cause, tmp_path):
+    """Who is down, the time of a radio and wrong clocks are in the scenario and in the log."""
+    sampled = {"nodes": [0], "H": [[1.0, 0.0]], "R": [[0.3]], "sampling": {"kind": "poisson"}}
+    sampled["sampling"]["rate"] = 2.0
+    network = {
+        "graph": {"kind": "path", "nodes": 3},
+        "activation": {"kind": "poisson", "rate": 3.0, "at": "nodes"},
+        "channel": {"delay": {"kind": "exponential", "mean": 0.2}, "symmetric": False},
+    }
+    changes = {"sensors": [sampled], "network": network | CAUSES[cause], "horizon": 8.0}
+    scenario = netkf.load(SCENARIOS / "poisson_ring.toml", changes)
+    run = netkf.simulate(scenario, engine="simpy")
+    netkf.export_log(run, tmp_path / "log")
+    _, notes = netkf.import_log(tmp_path / "log", "csv", tmp_path / "out")
+    assert any("the rate of network.radio" in note for note in notes) == (cause == "radio")
+    replay = netkf.simulate(netkf.load(tmp_path / "out" / "scenario.toml"), engine="simpy")
+    assert netkf.first_difference(run, replay) is None
+    np.testing.assert_array_equal(run.xhat, replay.xhat)
+
+
 SENSORS = [{"nodes": [0], "H": [[1.0, 0.0]], "R": [[0.25]]}]
 
 
