@@ -175,8 +175,8 @@ def export_log(run: Run, out: str | Path) -> tuple[Path, ...]:
     source = f"# netkf: seed {run.seed}, replica {run.replica}, engine {run.engine}\n"
     files: Files = {"packets.csv": source + table.to_csv(index=False)}
     activation = scenario.network.activation
-    own_clocks = isinstance(activation, LinkClock) and activation.at != "readings"
-    if own_clocks and not scenario.network.clocks:
+    right = not scenario.network.clocks
+    if right and isinstance(activation, LinkClock) and activation.at != "readings":
         rows = run.log[run.log["kind"] == CODES["tick"]]
         stamps = [scenario.time.stamps.text(t) for t in rows["t"].tolist()]
         ticks = pd.DataFrame({"t": stamps, "node": [names[i] for i in rows["node"].tolist()]})

@@ -100,12 +100,12 @@ def _check_blocks(scenario: DerivedScenario) -> None:
             if not knows_blocks or not np.isin(support, view).any():
                 rule = f"must read blocks that node {node} estimates, for the {name}"
                 listed = ", ".join(f'"{name}"' for name in scenario.layout.names)
-                others = any(
+                elsewhere = any(
                     place.node not in (None, node)
                     and any(place.first <= entry < place.first + place.n for entry in support)
                     for place in scenario.layout.places
                 )
-                choice = '"own+neighbours"' if others else f"[{listed}]"
+                choice = '"own+neighbours"' if elsewhere else f"[{listed}]"
                 remedy = f'write filter.estimates = {choice} or "all"'
                 raise ScenarioError(key, rule, scenario.filter.estimates, remedy)
             sensor = scenario.sensors[placed.entry]
