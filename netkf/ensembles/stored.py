@@ -123,12 +123,8 @@ def _read_averages(rows: list[dict[str, Any]]) -> tuple[FloatArray, FloatArray]:
     def column(name: str) -> FloatArray:
         return np.array([row.get(name) for row in rows], dtype=np.float64)
 
-    # The summary has the root of the mean square error; the standard error of its square is 2 rms
-    # times that of the root.
-    rms, rms_se = column("rms_error"), column("rms_error_se")
-    with np.errstate(over="ignore", invalid="ignore"):
-        means = [rms**2, column("mean_trace"), column("mean_nees")]
-        errors = [2.0 * rms * rms_se, column("mean_trace_se"), column("mean_nees_se")]
+    names = "mean_sq_error", "mean_trace", "mean_nees"
+    means, errors = [column(name) for name in names], [column(f"{name}_se") for name in names]
     return np.column_stack(means), np.column_stack(errors)
 
 

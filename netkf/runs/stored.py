@@ -37,6 +37,8 @@ AVERAGES_FORM: dict[str, Any] = dict.fromkeys(
     (
         "rms_error",
         "rms_error_se?",
+        "mean_sq_error?",
+        "mean_sq_error_se?",
         "mean_trace",
         "mean_trace_se?",
         "mean_nees",

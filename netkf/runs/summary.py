@@ -262,6 +262,8 @@ def node_rows(
         if error is not None:
             columns["rms_error_se"] = np.where(rms == 0.0, 0.0, error[:, 0] / (2.0 * rms))
             columns |= {"mean_trace_se": error[:, 1], "mean_nees_se": error[:, 2]}
+            # Roots do not say what they are of to the last bit.
+            columns |= {"mean_sq_error": mean[:, 0], "mean_sq_error_se": error[:, 0]}
         if bound is not None:
             columns |= {"bound": bound, "ratio": mean[:, 1] / bound}
             columns |= {} if error is None else {"ratio_se": error[:, 1] / bound}
