@@ -26,7 +26,8 @@ ARRAY = """\
 
 # Each job takes the runs of its part that have no result yet. A job that is killed or requeued
 # goes on where it was, and a part that is finished is left alone.
-srun {work}
+# Change {tasks} too for an array of all runs with another number of jobs.
+srun {work} --part "$SLURM_ARRAY_TASK_ID/{tasks}"
 status=$?
 # 1: the time was up before the part was finished.
 if [ $status -eq 1 ]; then scontrol requeue "${{SLURM_ARRAY_JOB_ID}}_${{SLURM_ARRAY_TASK_ID}}"; fi
@@ -75,6 +76,7 @@ def _array(directory: Path, name: str, tasks: int, options: argparse.Namespace) 
     return ARRAY.format(
         name="".join(c if c.isalnum() or c in "-_." else "-" for c in f"netkf-{name}")[:100],
         last=tasks - 1,
+        tasks=tasks,
         hours=minutes // 60,
         minutes=minutes % 60,
         log=str(directory.parent / f"{directory.name}-%A_%a.log"),

@@ -95,6 +95,7 @@ class BlockFiles(ABC):
         self._lock = threading.RLock()  # another thread may write as the process ends
         self._spent = self._written = 0.0  # CPU seconds of all results, and of those written
         self.installations: list[dict[str, Any]] = []  # of the nodes that were found
+        self._remedy = "go on with --resume, which does it again"
 
     @property
     def nodes(self) -> list[Node]:
@@ -128,6 +129,8 @@ class BlockFiles(ABC):
         With ``any_installation`` blocks may come from other versions and machines, and no file is
         removed: workers may be at work there. Only those with replicas ``within`` a range are read.
         """
+        if any_installation:
+            self._remedy = "another worker may have merged it: give the same command again"
         bad: list[tuple[str, str]] = []
         found: dict[Node, dict[str, Any]] = {}
         here = {"versions": versions(), "machine": machine()}
@@ -265,8 +268,7 @@ class BlockFiles(ABC):
         except DamagedError as error:
             with contextlib.suppress(OSError):
                 self._path(node).unlink()
-            message, remedy = f"{self._path(node)} {error}", "go on with --resume"
-            raise EngineError(f"{message}; {remedy}, which does it again") from None
+            raise EngineError(f"{self._path(node)} {error}; {self._remedy}") from None
 
 
 def _neighbour(node: Node) -> Node:

@@ -18,6 +18,7 @@ import netkf
 from netkf.cli.commands import parse_duration
 from netkf.cli.main import main
 from netkf.ensembles import block_files, checkpoints, parts, plans
+from netkf.ensembles.checkpoints import BlockCheckpoints
 from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
 from netkf.ensembles.parts import Part, part_of_array
 from netkf.ensembles.plans import open_plan, work_on_plan
@@ -74,6 +75,27 @@ def test_shuffled_workers_are_one_run(plan, whole, capsys):
     for again in (work, merge):
         assert again(plan) == 0
         assert "nothing left to do" in capsys.readouterr().out
+    assert files(plan) == whole
+
+
+def test_a_block_that_another_worker_merges_meanwhile(plan, whole, monkeypatch, capsys):
+    assert work(plan) == 0
+    load = BlockCheckpoints.load
+
+    def load_late(self, node):
+        for file in (plan / "blocks").glob("*.npz"):
+            file.rename(file.with_suffix(".away"))
+        return load(self, node)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(BlockCheckpoints, "load", load_late)
+        assert merge(plan) == 2
+    error = capsys.readouterr().err
+    assert "another worker may have merged it: give the same command again" in error
+    assert "--resume" not in error
+    for file in (plan / "blocks").glob("*.away"):
+        file.rename(file.with_suffix(".npz"))
+    assert merge(plan) == 0
     assert files(plan) == whole
 
 
@@ -340,7 +362,13 @@ def test_slurm_script(tmp_path, capsys):
     for words in ("--array=0-7", "--signal=TERM@", "--requeue", "--time=01:30:00", "--for 88m"):
         assert words in script
     shell = shutil.which("bash")
-    assert subprocess.run([shell, "-n"], input=script, text=True, check=False).returncode == 0
+    # sbatch --array=0-1 submits two of the eight again.
+    srun, job = 'srun() { printf "%s\\n" "$@"; }\n', {**os.environ, "SLURM_ARRAY_TASK_ID": "1"}
+    piped = {"input": srun + script, "text": True, "capture_output": True}
+    done = subprocess.run([shell], check=False, env=job, **piped)
+    assert done.stdout.split("\n")[:3] == ["netkf", "work", str(tmp_path / "my plan")]
+    assert done.stdout.endswith("--part\n1/8\n")
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_no_plan_is_made_of_what_could_not_run(tmp_path, capsys):
