@@ -118,17 +118,26 @@ def restamp(part: Any, stamps: TimeBase) -> Any:
 
 
 def stamp_notes(scenario: Any) -> tuple[str, ...]:
-    """Return a line if every record begins long after 0, by horizon and own length."""
+    """Return a line if every record begins long after 0, by horizon and own length, or an origin
+    leaves none in the run.
+    """
     times = [t for t in _recorded_times(scenario) if t.size]
-    if scenario.time.origin is not None or not times:
+    if not times:
         return ()
-    first, last = min(t.min() for t in times), max(t.max() for t in times)
+    first, last = (float(pick(np.concatenate(times))) for pick in (np.min, np.max))
+    if scenario.time.origin is not None:
+        if first < scenario.horizon and last >= 0.0:
+            return ()
+        where = f"end before 0, at t = {last!r}"
+        if last >= 0.0:
+            where = f"begin after the horizon, at t = {first!r}"
+        return (f"all records {where}: check [time] origin, in seconds whatever the unit is",)
     if first < max(LATE, 10.0 * (last - first), 0.5 * scenario.horizon):
         return ()
     return (
-        f"all records begin long after 0, the first at t = {float(first)!r}: the run begins at 0, "
+        f"all records begin long after 0, the first at t = {first!r}: the run begins at 0, "
         f"with mean and cov of that time. If it should begin with the records, write [time] origin "
-        f"= {float(np.floor(first)):.0f}, and count horizon and probe from there",
+        f"= {math.floor(first)}, and count horizon and probe from there",
     )
 
 
@@ -138,11 +147,11 @@ def _recorded_times(scenario: Any) -> Iterator[FloatArray]:
             yield sensor.record.columns["t"]
         clock = getattr(sensor, "sampling", None)
         if isinstance(clock, RecordedSampling):
-            yield from map(clock.recorded_times, clock.listed)
+            yield np.array([t for _, t in clock.row_times])
     if isinstance(scenario.network.activation, RecordedClock):
         yield scenario.network.activation.rows
     if isinstance(scenario.network.activation, Contacts):
-        yield np.array([begin for _, begin, _ in scenario.network.activation.row_keys])
+        yield np.array([t for _, *ends in scenario.network.activation.row_keys for t in ends])
     positions = scenario.position_table
     if positions is not None and positions.timed:
         yield np.array([t for _, t in positions.row_keys])

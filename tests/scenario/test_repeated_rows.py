@@ -228,6 +228,27 @@ def test_rows_before_the_origin_of_a_log_are_counted(changes, key, tmp_path):
         netkf.scenario.reading.from_table(CLOCKS, tmp_path).replace(changes)
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"network.activation": {**RECORDED, "at": "nodes"}},
+        {"sensors": [{**SENSOR, "sampling": RECORDED}]},
+    ],
+)
+def test_an_origin_that_leaves_no_row_in_the_run_is_noted(changes, tmp_path):
+    """One in milliseconds, as the rows are, is a thousand times too late: it is in seconds."""
+    (tmp_path / "table.csv").write_text("t,node\n1701000,0\n1702000,0\n")
+    for origin, words in {
+        1700000: "end before 0, at t = -1698298.0: check",
+        1690: "begin after the horizon, at t = 11.0: check",
+        1700: None,
+    }.items():
+        base = {**CLOCKS, "time": {"origin": origin, "unit": "ms"}}
+        notes = netkf.scenario.reading.from_table(base, tmp_path).replace(changes).notes
+        found = [note for note in notes if note.startswith("all records")]
+        assert found == [note for note in notes if words and words in note], origin
+
+
 def test_a_counter_that_wraps_is_told_how_to_go_on(make):
     with pytest.raises(netkf.ScenarioError, match="if a counter of the log wraps, add its length"):
         make("losses", "0,1,0,0\n")
