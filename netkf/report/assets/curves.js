@@ -32,7 +32,7 @@ const Curves = (() => {
         cursor: { drag: { x: Boolean(timed), y: false, setScale: false, dist: 6 }, y: false },
         scales: { x: { time: false, ...(timed ? { range: (u, low, high) => app.span || (app.runs.length ? [0, app.end] : [low, high > low ? high : low + 1]) } : {}), ...(xlabel === "node" ? { range: (u, low, high) => [low - 0.5, high + 0.5] } : {}) }, y: { range: (u, low, high) => yRange(low, high, lines, band, steep) } },
         axes: [{ ...axis, label: xlabel || "time (s)", labelSize: 22, size: 34,
-          ...(WHOLE.includes(xlabel) ? { values: (u, splits) => splits.map((v) => (Number.isInteger(v) ? String(v) : "")) } : {}) }, { ...axis, label: unit, labelSize: 20, size: 58, values: (u, splits) => splits.map(steep ? powerOfTen : tick) }],
+          ...(WHOLE.includes(xlabel) ? { values: (u, splits) => splits.map((v) => (Number.isInteger(v) ? String(v) : "")) } : {}) }, { ...axis, label: unit, labelFont: Math.min(12, 360 / unit.length) + "px system-ui, sans-serif", labelSize: 20, size: 58, values: (u, splits) => splits.map(steep ? powerOfTen : tick) }],
         series: [{}, ...expanded(series)],
         bands: bandsOf(series),
         hooks: { setSelect: [(u) => {

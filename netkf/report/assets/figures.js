@@ -188,7 +188,7 @@ const Figures = (() => {
       series.push({ label: name + "square root of mean trace P", x, y: root(of("mean_trace")), colour: coloured(summaries, r, "green"), mark: "ring" });
       if (of("bound").some(Number.isFinite)) series.push({ label: name + "square root of its bound", x, y: root(of("bound").map((v) => v ?? NaN)), colour: coloured(summaries, r, "ink"), mark: "tick" });
     });
-    return series.length ? { title: "Averages per node", unit: "root mean square, " + page.unit, xlabel: "node", series, note: "Over time; the numbers stand in the table." } : null;
+    return series.length ? { title: "Averages per node", unit: page.unit, xlabel: "node", series, note: "Root mean squares over time; the numbers stand in the table." } : null;
   }
 
   function ensemble(app, ensembles) {
