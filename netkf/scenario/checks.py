@@ -284,15 +284,17 @@ def _check_clocks(scenario: DerivedScenario) -> None:
     clocks, why = scenario.network.clocks, None
     _check_owners(scenario, "clocks", clocks)
     nodes = [node for entry in clocks for node in entry.nodes]
-    placed = [p for node in nodes for p in scenario.placed_sensors.get(node, ())]
+    sensors, placed, remedy = scenario.sensors, scenario.placed_sensors, "remove it"
+    recorded = [i for i in nodes if any(sensors[p.entry].record for p in placed.get(i, ()))]
     if scenario.slotted:
         why = "belongs to continuous time: slots begin for all nodes at once"
-    elif any(scenario.sensors[p.entry].record is not None for p in placed):
-        why = "cannot be of nodes whose readings are recorded, with the stamps they have"
+    elif recorded:
+        why, nodes = "cannot be of nodes whose readings are recorded, with their stamps", recorded
+        remedy = "leave these out, and write into their tables the stamps that filters believe"
     elif scenario.input_responses is not None or len(scenario.followed_changes):
         why = "cannot stand beside inputs or changes of a linear plant that filters know"
     if clocks and why is not None:
-        raise ScenarioError("network.clocks", why, sorted(nodes), "remove it")
+        raise ScenarioError("network.clocks", why, sorted(nodes), remedy)
 
 
 def _check_faults(scenario: DerivedScenario) -> None:

@@ -319,9 +319,12 @@ def test_drawn_clocks_differ_by_node_and_run_and_have_their_law(scenario_of):
         ({"filter": {"kind": "central"}}, "network.clocks"),
         ({"sensors": [{"nodes": [1], "H": [[1.0, 0.0]], "R": [[1.0]]}]}, "network.clocks[0].nodes"),
         ({"plant.input": {"kind": "constant", "G": [[1.0], [0.0]], "value": [1.0]}}, "clocks"),
+        ({"sensors": [{"kind": "recorded", "path": "y.csv", "H": [[1.0, 0.0]], "R": [[1.0]]}]},
+         "got [2]; leave these out"),
     ],
 )  # fmt: skip
-def test_what_has_no_meaning_is_refused(scenario_of, changes, key):
+def test_what_has_no_meaning_is_refused(scenario_of, changes, key, tmp_path):
+    (tmp_path / "y.csv").write_text("t,node,y0\n1,0,0.5\n1,2,0.5\n")
     with pytest.raises(ScenarioError) as error:
         scenario_of().replace(changes)
     assert key in str(error.value)
