@@ -235,10 +235,15 @@ def format_comparison(comparison: Comparison) -> str:
     if len(rows) > MAX_ROWS:
         rows = [*rows[: MAX_ROWS - 3], _rest_row(len(rows) - MAX_ROWS, numbered), *rows[-3:]]
     lines += ["", format_table(["", *numbered], rows, left_columns=1)]
+    return "\n".join([*lines, *_remark_lines(comparison, numbered)])
+
+
+def _remark_lines(comparison: Comparison, numbered: list[str]) -> list[str]:
+    """Return the notes, and what the stars mean, each after an empty line."""
     notes = [f"note: {remark}" for remark in comparison.remarks()]
     for mark, texts in zip(numbered, comparison.notes, strict=True):
         notes += [f"note: {mark} {shorten(note, 500)}" for note in texts]
-    lines += ["", *notes] if notes else []
+    lines = ["", *notes] if notes else []
     methods = {e.method for row in comparison.rows for e in row.entries if e.method}
     intervals = ", ".join(sorted(methods - {"one run"}))
     if intervals:
@@ -246,7 +251,7 @@ def format_comparison(comparison: Comparison) -> str:
         lines += ["", f"* differs from (1) for certain; {together}"]
     if "one run" in methods:
         lines += ["", "differences of single runs are not marked: they may be chance"]
-    return "\n".join(lines)
+    return lines
 
 
 def _setting_lines(comparison: Comparison, numbered: list[str]) -> list[str]:
