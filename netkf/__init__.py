@@ -134,36 +134,19 @@ __all__ = [
 ]
 
 
-def _promise_traces(*arguments: Any) -> Any:
-    """Call ``theory.traces.promise_traces`` for the core."""
-    from netkf.theory.traces import promise_traces
+def _late(module: str, name: str) -> Any:
+    """Return a function of a wing for the core, which is imported when it is called."""
 
-    return promise_traces(*arguments)
+    def call(*arguments: Any) -> Any:
+        return getattr(importlib.import_module(module), name)(*arguments)
 
-
-def _draw(*arguments: Any) -> Any:
-    """Call ``figures.catalogue.plot`` for the core."""
-    from netkf.figures.catalogue import plot
-
-    return plot(*arguments)
+    return call
 
 
-def _to_xarray(result: Any) -> Any:
-    """Call ``neighbours.datasets.to_xarray`` for the core."""
-    from netkf.neighbours.datasets import to_xarray
-
-    return to_xarray(result)
-
-
-def _to_stonesoup(*arguments: Any) -> Any:
-    """Call ``neighbours.stone_soup.to_stonesoup`` for the core."""
-    from netkf.neighbours.stone_soup import to_stonesoup
-
-    return to_stonesoup(*arguments)
-
-
-WINGS.promise_traces, WINGS.draw = _promise_traces, _draw
-WINGS.to_xarray, WINGS.to_stonesoup = _to_xarray, _to_stonesoup
+WINGS.promise_traces = _late("netkf.theory.traces", "promise_traces")
+WINGS.draw = _late("netkf.figures.catalogue", "plot")
+WINGS.to_xarray = _late("netkf.neighbours.datasets", "to_xarray")
+WINGS.to_stonesoup = _late("netkf.neighbours.stone_soup", "to_stonesoup")
 
 
 def __getattr__(name: str) -> Any:

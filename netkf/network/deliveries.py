@@ -62,6 +62,11 @@ class Deliveries:
         return np.asarray(chosen[np.searchsorted(chosen, numbers)] == numbers)
 
 
+def _of_given(name: str) -> Any:
+    """Return a property with the value of the model ``given``."""
+    return property(lambda self: getattr(self.given, name), doc="The value of the model ``given``.")
+
+
 @dataclass(frozen=True, eq=False)
 class DeliveringLoss(Loss):
     """The loss model ``given`` of the run, except that the messages of ``deliveries`` arrive.
@@ -76,34 +81,15 @@ class DeliveringLoss(Loss):
     # A mutable object, set before each replay: one scenario with its cached tables serves all.
     deliveries: Deliveries = field(instance_of(Deliveries))
 
-    @property
-    def deterministic(self) -> bool:
-        """The value of the model ``given``, so that the same numbers are drawn."""
-        return self.given.deterministic
-
-    @property
-    def stateful(self) -> bool:
-        """The value of the model ``given``, so that the same numbers are drawn."""
-        return self.given.stateful
-
-    @property
-    def follows_distance(self) -> bool:
-        """The value of the model ``given``."""
-        return self.given.follows_distance
+    deterministic = _of_given("deterministic")
+    stateful = _of_given("stateful")
+    follows_distance = _of_given("follows_distance")
+    fate_share = _of_given("fate_share")
+    state_of = _of_given("state_of")
 
     def conditions(self, random: np.random.Generator, horizon: float) -> Any:
         """Return the conditions of the run by the model ``given``."""
         return self.given.conditions(random, horizon)
-
-    @property
-    def fate_share(self) -> float:
-        """The value of the model ``given``, so that the same numbers are drawn."""
-        return self.given.fate_share
-
-    @property
-    def state_of(self) -> str:
-        """The value of the model ``given``, so that the same numbers are drawn."""
-        return self.given.state_of
 
     def next_state(self, link: Link, bad: bool | None, random: np.random.Generator) -> bool:
         """Return the next state of the channel, True if it is bad, by the model ``given``."""
@@ -141,20 +127,9 @@ class DelayUnlessWaived(Delay):
         """Return a draw of the model ``given``."""
         return self.given.draw(random)
 
-    @property
-    def fixed(self) -> float | None:
-        """The value of the model ``given``."""
-        return self.given.fixed
-
-    @property
-    def longest(self) -> float:
-        """The value of the model ``given``."""
-        return self.given.longest
-
-    @property
-    def is_random(self) -> bool:
-        """The value of the model ``given``, so that the same numbers are drawn."""
-        return self.given.is_random
+    fixed = _of_given("fixed")
+    longest = _of_given("longest")
+    is_random = _of_given("is_random")
 
     def message_delay(self, sent: Transmission, drawn: float) -> float:
         """Return the delay in seconds: 0 for a message in ``deliveries.without_delay``."""

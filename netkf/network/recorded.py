@@ -6,12 +6,13 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, ClassVar
 
 import numpy as np
 
 from netkf.core.csv_files import read_columns
 from netkf.core.errors import ScenarioError, errors_under
-from netkf.core.fields import SourceFile, field, one_of, source_file
+from netkf.core.fields import Component, SourceFile, field, one_of, source_file
 from netkf.core.repeated_rows import RowUse, count_rows, first_rows
 from netkf.network.delays import Delay
 from netkf.network.graphs import Link, Topology, demand_links
@@ -94,7 +95,26 @@ def read_messages(
 
 
 @dataclass(frozen=True, eq=False)
-class RecordedLoss(Loss):
+class _Recorded(Component):
+    """Outcomes of messages from the table at ``path``."""
+
+    path: SourceFile = field(source_file)
+    after: str = field(_after, default="deliver")
+
+    table: ClassVar[Any]
+
+    def __post_init__(self) -> None:
+        """Check the fields and read the table; raises ScenarioError for a mistake in either."""
+        super().__post_init__()
+        _ = self.table  # a mistake in the file is found on construction
+
+    def check(self, topology: Topology) -> None:
+        """Raise ScenarioError unless every recorded pair is a link."""
+        demand_links(self.path, self.table.lines, topology)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedLoss(_Recorded, Loss):
     """Outcomes read from a table ``sender,receiver,message,delivered`` (0 or 1).
 
     Messages of a directed link are counted from 0; ``after`` is the treatment of a message that is
@@ -104,14 +124,6 @@ class RecordedLoss(Loss):
     independent = False
 
     deterministic = True
-
-    path: SourceFile = field(source_file)
-    after: str = field(_after, default="deliver")
-
-    def __post_init__(self) -> None:
-        """Check the fields and read the table; raises ScenarioError for a mistake in either."""
-        super().__post_init__()
-        _ = self.table  # a mistake in the file is found on construction
 
     @cached_property
     def table(self) -> MessageTable:
@@ -130,13 +142,9 @@ class RecordedLoss(Loss):
         """Return nan: the fraction is unknown before a run."""
         return math.nan
 
-    def check(self, topology: Topology) -> None:
-        """Raise ScenarioError unless every recorded pair is a link."""
-        demand_links(self.path, self.table.lines, topology)
-
 
 @dataclass(frozen=True, eq=False)
-class RecordedDelay(Delay):
+class RecordedDelay(_Recorded, Delay):
     """Delays read from a table ``sender,receiver,message,seconds``.
 
     Messages of a directed link are counted from 0; ``after`` is the treatment of a message that is
@@ -144,14 +152,6 @@ class RecordedDelay(Delay):
     """
 
     is_random = False
-
-    path: SourceFile = field(source_file)
-    after: str = field(_after, default="deliver")
-
-    def __post_init__(self) -> None:
-        """Check the fields and read the table; raises ScenarioError for a mistake in either."""
-        super().__post_init__()
-        _ = self.table  # a mistake in the file is found on construction
 
     @cached_property
     def table(self) -> MessageTable:
@@ -175,10 +175,6 @@ class RecordedDelay(Delay):
         if value is None:
             return math.nan if self.after == "lose" else 0.0
         return value
-
-    def check(self, topology: Topology) -> None:
-        """Raise ScenarioError unless every recorded pair is a link."""
-        demand_links(self.path, self.table.lines, topology)
 
 
 def _value_at(key: str, table: MessageTable, sent: Transmission, after: str) -> float | None:
