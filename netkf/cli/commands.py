@@ -264,6 +264,7 @@ PLANNED = _option("directory", "directory of a plan", type=Path, metavar="DIR")
 JSON = _flag("--json", "print one JSON document only")
 ALL = _flag("--all", "show all rows with all that they say")
 NO_PLOT = _flag("--no-plot", "do not draw a picture")
+STUDY = SEED, ENGINE, POOL, JSON, *PLAN
 
 COMMANDS = (
     Command(
@@ -362,11 +363,7 @@ COMMANDS = (
             _runs("runs at each point", 1),
             _out("directory (default: runs/NAME-sweep-k)"),
             NO_PLOT,
-            SEED,
-            ENGINE,
-            POOL,
-            JSON,
-            *PLAN,
+            *STUDY,
         ),
     ),
     Command(
@@ -390,11 +387,7 @@ COMMANDS = (
             ),
             _runs("at most this many runs per value", 1000),
             _confidence(0.95, "that all decisions are right"),
-            SEED,
-            ENGINE,
-            POOL,
-            JSON,
-            *PLAN,
+            *STUDY,
         ),
     ),
     Command(
@@ -443,11 +436,7 @@ COMMANDS = (
             _confidence(0.95, "that all marks are right"),
             _out("directory for tables and a picture"),
             NO_PLOT,
-            SEED,
-            ENGINE,
-            POOL,
-            JSON,
-            *PLAN,
+            *STUDY,
         ),
     ),
     Command(

@@ -10,6 +10,7 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.random import Generator
 
 from netkf.core.clock import Clock, Entity
 from netkf.core.csv_files import read_columns, read_header
@@ -71,13 +72,7 @@ class OnReadings(LinkClock):
         return ()
 
     def ticks(
-        self,
-        entity: Entity,
-        origin: float,
-        index: int,
-        now: float,
-        random: np.random.Generator,
-        count: int,
+        self, entity: Entity, origin: float, index: int, now: float, random: Generator, count: int
     ) -> FloatArray:
         """Return no ticks (0,)."""
         return np.empty(0)
@@ -152,13 +147,7 @@ class Poisson(LinkClock):
         return math.nan if rate is None else rate
 
     def ticks(
-        self,
-        entity: Entity,
-        origin: float,
-        index: int,
-        now: float,
-        random: np.random.Generator,
-        count: int,
+        self, entity: Entity, origin: float, index: int, now: float, random: Generator, count: int
     ) -> FloatArray:
         """Return the next ``count`` ticks (count,) of ``entity`` in seconds."""
         return _accumulate(now, random.standard_exponential(count) / self.mean_rate(entity))
@@ -283,13 +272,7 @@ class Renewal(LinkClock):
         return Lattice(self.mean_gap, self.mean_gap)  # the first tick is one gap after time 0
 
     def ticks(
-        self,
-        entity: Entity,
-        origin: float,
-        index: int,
-        now: float,
-        random: np.random.Generator,
-        count: int,
+        self, entity: Entity, origin: float, index: int, now: float, random: Generator, count: int
     ) -> FloatArray:
         """Return the next ``count`` ticks (count,) in seconds, after the last one at ``now``."""
         # Gaps of unit scale, scaled to their mean.
@@ -334,7 +317,7 @@ class Periodic(LinkClock):
             if isinstance(value, float) and value >= self.period:
                 raise ScenarioError(name, "must be below the period", value, "give less")
 
-    def origin(self, entity: Entity, random: Callable[[], np.random.Generator]) -> float:
+    def origin(self, entity: Entity, random: Callable[[], Generator]) -> float:
         """Return the phase in seconds, the time from which the ticks of ``entity`` are counted."""
         if isinstance(self.phase, str):
             return self.period * float(random().random())
@@ -352,13 +335,7 @@ class Periodic(LinkClock):
         return Lattice(self.period, self.phase or self.period, self.jitter)
 
     def ticks(
-        self,
-        entity: Entity,
-        origin: float,
-        index: int,
-        now: float,
-        random: np.random.Generator,
-        count: int,
+        self, entity: Entity, origin: float, index: int, now: float, random: Generator, count: int
     ) -> FloatArray:
         """Return the ticks (count,) of an entity in seconds from number ``index`` on."""
         # With phase 0 the lattice point at time 0 is no tick.
@@ -426,13 +403,7 @@ class RecordedClock(LinkClock):
         return self._rows[0]
 
     def ticks(
-        self,
-        entity: Entity,
-        origin: float,
-        index: int,
-        now: float,
-        random: np.random.Generator,
-        count: int,
+        self, entity: Entity, origin: float, index: int, now: float, random: Generator, count: int
     ) -> FloatArray:
         """Return up to ``count`` recorded times (<= count,) of ``entity`` in seconds."""
         return self._instants.get(entity, np.empty(0))[index : index + count]

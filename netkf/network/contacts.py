@@ -10,6 +10,7 @@ from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
+from numpy.random import Generator
 
 from netkf.core.clock import Entity
 from netkf.core.csv_files import read_columns
@@ -104,7 +105,7 @@ class Contacts(LinkClock):
             latest[pair] = max(end, latest.get(pair, -math.inf))
         return count
 
-    def origin(self, entity: Entity, random: Callable[[], np.random.Generator]) -> float:
+    def origin(self, entity: Entity, random: Callable[[], Generator]) -> float:
         """Return the phase of ``clock`` in seconds, drawn by ``random()`` if it is random."""
         return self.clock.origin(entity, random)
 
@@ -136,13 +137,7 @@ class Contacts(LinkClock):
         return float(np.maximum(off.min(axis=1, initial=math.inf), 0.0).max(initial=0.0))
 
     def ticks(
-        self,
-        entity: Entity,
-        origin: float,
-        index: int,
-        now: float,
-        random: np.random.Generator,
-        count: int,
+        self, entity: Entity, origin: float, index: int, now: float, random: Generator, count: int
     ) -> FloatArray:
         """Return the next ``count`` ticks (<= count,) of ``entity`` in seconds."""
         if entity not in self._intervals or math.isinf(now):
