@@ -88,6 +88,8 @@ def _slices(log: np.ndarray, pids: dict[int, int], span: float) -> Iterator[Even
     widest = max(_micro(span) / WIDEST, 0.001)
     for node, pid in pids.items():
         own = log[log["node"] == node]
+        if not len(own):
+            continue
         instants, first = np.unique(own["t"], return_index=True)
         starts = [_micro(t) for t in instants.tolist()]
         for k, events in enumerate(np.split(own, first[1:])):

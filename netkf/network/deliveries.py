@@ -13,6 +13,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.network.delays import Delay
 from netkf.network.graphs import Link, Topology
 from netkf.network.losses import Loss, Transmission, delivery_probabilities
+from netkf.network.scheduled import Hopping
 
 
 class MessageKey(NamedTuple):
@@ -44,13 +45,14 @@ class Deliveries:
         for sender, receiver, message in chosen or ():
             self._numbers.setdefault((sender, receiver), []).append(message)
 
-    def given(self, loss: Loss, sent: Transmission) -> FloatArray:
+    def given(self, loss: Loss, sent: Transmission, hops: Hopping | None = None) -> FloatArray:
         """Return the delivery probabilities (K,) of ``sent``, the same in each replay."""
         # A message has another time if a node that decides was silent before.
         number, time = (sent.number[0], sent.time[0]) if len(sent.number) else (0, 0.0)
         key = sent.link, int(number), len(sent.number), float(time)
         if key not in self._given:
-            self._given[key] = delivery_probabilities(loss, sent)
+            values = delivery_probabilities(loss, sent)
+            self._given[key] = values if hops is None else values * hops.delivery(sent)
         return self._given[key]
 
     def are_chosen(self, link: Link, numbers: np.ndarray) -> np.ndarray:
@@ -69,7 +71,8 @@ def _of_given(name: str) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class DeliveringLoss(Loss):
-    """The loss model ``given`` of the run, except that the messages of ``deliveries`` arrive.
+    """The loss model ``given`` of the run, and that of the ``channels`` over which its messages
+    hop, except that the messages of ``deliveries`` arrive.
 
     All but the chosen messages have the same draws and outcomes as in the run.
     """
@@ -80,12 +83,17 @@ class DeliveringLoss(Loss):
     given: Loss = field(instance_of(Loss))
     # A mutable object, set before each replay: one scenario with its cached tables serves all.
     deliveries: Deliveries = field(instance_of(Deliveries))
+    channels: Hopping | None = field(instance_of(Hopping), default=None)
 
-    deterministic = _of_given("deterministic")
     stateful = _of_given("stateful")
     follows_distance = _of_given("follows_distance")
     fate_share = _of_given("fate_share")
     state_of = _of_given("state_of")
+
+    @property
+    def deterministic(self) -> bool:
+        """True if outcomes need no random number, as in the run."""
+        return self.given.deterministic and self.channels is None
 
     def conditions(self, random: np.random.Generator, horizon: float) -> Any:
         """Return the conditions of the run by the model ``given``."""
@@ -99,9 +107,11 @@ class DeliveringLoss(Loss):
         """Return 1 for messages that the replay delivers, else the given probability."""
         chosen = self.deliveries.chosen
         if np.ndim(sent.number) == 0:
-            is_chosen = chosen is None or (*sent.link, sent.number) in chosen
-            return 1.0 if is_chosen else self.given.delivery_probability(sent)
-        values = self.deliveries.given(self.given, sent).copy()
+            if chosen is None or (*sent.link, sent.number) in chosen:
+                return 1.0
+            given = self.given.delivery_probability(sent)
+            return given if self.channels is None else given * self.channels.delivery(sent)
+        values = self.deliveries.given(self.given, sent, self.channels).copy()
         values[self.deliveries.are_chosen(sent.link, sent.number)] = 1.0
         return values
 

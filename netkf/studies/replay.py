@@ -127,7 +127,9 @@ def delivering(scenario: Scenario, deliveries: Deliveries) -> Scenario:
     """Return the scenario whose channel delivers what ``deliveries`` names, else as drawn."""
     network = scenario.network
     channel_of_run = network.channel
-    loss, delay = DeliveringLoss(channel_of_run.loss, deliveries), channel_of_run.delay
+    hops = channel_of_run.channels
+    loss = DeliveringLoss(channel_of_run.loss, deliveries, channels=hops)
+    delay = channel_of_run.delay
     # Without delays no message is late, and the engines have a faster path.
     if not isinstance(delay, NoDelay):
         delay = DelayUnlessWaived(delay, deliveries)

@@ -156,6 +156,19 @@ def test_a_log_with_one_fault_is_not_taken_for_whole(name, change, kind, runs):
     assert event_fault(scenario, with_log(run, change(run.log, kind)))
 
 
+@pytest.mark.parametrize("cause", ["gate", "quantise"])
+def test_refused_readings_and_clipped_messages_stand_anywhere_in_an_instant(runs, cause):
+    scenario, _ = runs["ring"]
+    sensor = {"nodes": [0, 3], "H": [[1.0, 0.0]], "R": [[0.25]]}
+    sensor["sampling"] = {"kind": "periodic", "period": 0.5}
+    table = {"probability": 0.05} if cause == "gate" else {"bits": 4, "range": 0.1}
+    key = {"gate": "filter.gate", "quantise": "network.quantise"}[cause]
+    scenario = scenario.replace({"sensors": [sensor], key: table})
+    run = netkf.simulate(scenario, seed=3, engine="simpy")
+    assert (run.events.kind == ("refuse" if cause == "gate" else "clip")).sum() > 5
+    assert event_fault(scenario, run) == ""
+
+
 def test_events_of_another_run_are_not_those_of_this_one(runs):
     scenario, _ = runs["ring"]
     other = netkf.simulate(scenario, seed=3, replica=4)

@@ -78,3 +78,12 @@ def test_a_window_of_slots_by_the_command(slot_run, tmp_path, capsys):
     assert "network" in names.values()  # rounds are events of no node
     assert main([*command, "--out", str(tmp_path / "run" / "trace.json")]) == 2
     assert "exists already" in capsys.readouterr().err
+
+
+def test_a_node_without_events_is_an_empty_track(run, tmp_path):
+    first = float(run.log["t"][0])
+    active = run.log[run.log["t"] == first]["node"]
+    assert set(run.nodes) - set(active.tolist())
+    (path,) = netkf.export_perfetto(run, tmp_path, first, first)
+    found, _ = events_of(path)
+    assert len(found["X"]) == len(set(active.tolist()))

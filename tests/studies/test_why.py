@@ -548,3 +548,45 @@ def test_a_message_that_is_sent_at_another_time_meets_another_law():
     for time in (1.0, 2.0, 1.0):
         sent = Transmission((0, 1), number=np.array([3]), time=np.array([time]))
         assert deliveries.given(loss, sent) == 0.1 * time
+
+
+HOPS = """
+format = 1
+name = "hops"
+horizon = 8.0
+probe = 1.0
+[plant]
+kind = "linear"
+period = 1.0
+F = [[0.95]]
+Q = [[0.3]]
+cov = [[1.0]]
+[[sensors]]
+nodes = [0]
+H = [[1.0]]
+R = [[0.1]]
+[network]
+graph = { kind = "path", nodes = 2 }
+activation = { kind = "broadcast" }
+[network.channel]
+loss = { kind = "gilbert-elliott", mean_loss = 0.3, mean_burst = 2.0 }
+channels = { hopping = [11, 26], path = "channels.csv" }
+[filter]
+kind = "intermittent"
+"""
+
+
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_replays_hop_over_the_channels_of_the_run(tmp_path, engine):
+    (tmp_path / "channels.csv").write_text("channel,delivery\n11,0.9\n26,0.2\n")
+    (tmp_path / "hops.toml").write_text(HOPS)
+    scenario = netkf.load(tmp_path / "hops.toml")
+    run = netkf.simulate(scenario, seed=2, engine=engine)
+    lost = run.events[run.events.kind == "lost"]
+    assert (lost.message % 2 == 1).any()
+    found = netkf.why(run, 1, 6.0)
+    sure = scenario.replace({"network.channel": {}})
+    at = run.times.tolist().index(6.0)
+    assert found.trace == pytest.approx(run.P[at, 1, 0, 0], rel=1e-12)
+    whole = netkf.simulate(sure, seed=2, engine=engine).P[at, 1, 0, 0]
+    assert found.what_ifs[-1].trace == pytest.approx(whole, rel=1e-12)

@@ -54,8 +54,9 @@ TIME_TOLERANCE = 1e-9
 
 def event_fault(scenario: Scenario, run: Run) -> str:
     """Return one line about the first fault of the record of a run's events; empty without one."""
-    # Links are looked at at ticks and at samples, before or after other events of the instant.
-    others = ("link", "crash", "restart", "join", "leave")
+    # Links are looked at at ticks and at samples, before or after other events of the instant;
+    # gates and quantisers stand between the events of several nodes.
+    others = ("link", "crash", "restart", "join", "leave", "refuse", "clip")
     log = run.log[~np.isin(run.log["kind"], [CODES[kind] for kind in others])]
     rules = [_ordered, _numbered, _decided, _absorbed]
     rules += [_read_in_slots, _sent_in_slots] if scenario.slotted else [_read, _ticked, _caused]
@@ -335,7 +336,9 @@ def _sent_in_slots(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
             yield f"{messages:,} messages of {ticks:,} pairs"
         return
     is_recorded = any(isinstance(sensor, RecordedSensor) for sensor in scenario.sensors)
-    if not (is_recorded or isinstance(activation, RecordedSlots)):
+    # What a gate refuses is not sent where messages have readings.
+    unsure = is_recorded or isinstance(activation, RecordedSlots) or scenario.filter.gate
+    if not unsure:
         yield from _sent_in_rounds(scenario, log)
 
 

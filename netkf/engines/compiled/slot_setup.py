@@ -354,7 +354,8 @@ class SlotSetup:
         self.deliveries: Deliveries | None = None
         if isinstance(channel.loss, DeliveringLoss):
             self.deliveries = channel.loss.deliveries
-            channel = dataclasses.replace(channel, loss=channel.loss.given)
+            loss, hops = channel.loss.given, channel.loss.channels
+            channel = dataclasses.replace(channel, loss=loss, channels=hops)
         self.channel, loss = channel, channel.loss
         # Numpy computes the probabilities of a user's own loss model (slot_tables).
         has_known_law = identical_per_link(loss) or type(loss) is GilbertElliott
