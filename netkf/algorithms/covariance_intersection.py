@@ -40,6 +40,7 @@ class CovarianceIntersection(Hybrid):
         record=covariance_intersection_record,
         begin=begin_estimate,
         unrolled=True,
+        on_estimates=(DiffusionFilter.kernels.emit, DiffusionFilter.kernels.absorb),
     )
 
     shift = Filter.shift  # affine: the weights sum to one

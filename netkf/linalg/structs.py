@@ -151,9 +151,11 @@ class Struct(metaclass=StructClass):
 
     @classmethod
     def at(cls, struct: Any) -> Any:
-        """Return a struct of this class for kernels, at the memory of another ``struct``."""
+        """Return a struct of this class for kernels, at the memory of another ``struct``, which it
+        keeps alive.
+        """
         made = object.__new__(cls)
-        made.__dict__.update(memory=struct.memory, address=struct.address)
+        made.__dict__.update(memory=struct.memory, address=struct.address, seen=struct)
         return made
 
     @classmethod

@@ -83,14 +83,15 @@ PROGRESS = np.dtype([(name, np.int64) for name in _POSITIONS])
 
 def is_immediate(scenario: Scenario) -> bool:
     """Return True if filters of a scenario can be simulated in SIMD lanes, as many nodes side by
-    side as a vector register holds: convex combinations, messages without delay, clocks that do not
-    tick together, and no sensors that take samples. Then no event depends on an estimate.
+    side as a vector register holds: exchanges of estimates alone, messages without delay, clocks
+    that do not tick together, and no sensors that take samples. Then no event depends on an
+    estimate.
     """
     node_filter, network = scenario.node_filter, scenario.network
     kernels = compiled_kernels(node_filter, clocked=True)
     return (
         kernels is not None
-        and kernels.is_convex
+        and kernels.exchanges_estimates
         and node_filter.timing.talks
         and scenario.views is None
         and scenario.plant.linear

@@ -31,6 +31,7 @@ from netkf.engines.compiled.events import (
 )
 from netkf.engines.compiled.lane_series import series_of_lanes
 from netkf.engines.compiled.life_tables import life_table
+from netkf.engines.compiled.pair_exchange import pair_exchange
 from netkf.engines.compiled.sample_tables import samples_of
 from netkf.engines.compiled.samples import by_node, entries_of, record_samples
 from netkf.engines.compiled.senders import senders_of
@@ -170,6 +171,7 @@ class Workspace:
         self._scratch: tuple[Scratch, FlowScratch] | None = None
         kernels = compiled_kernels(scenario.node_filter, clocked=True)
         assert kernels is not None
+        self._kernels = kernels
         self.clocked: ClockFilters | None = None
         if not is_immediate(scenario):
             self.clocked = ClockFilters(scenario, kernels, self._start, FIRST_MESSAGES)
@@ -186,7 +188,8 @@ class Workspace:
         capacity = together * len(self._start.nodes)
         if self._visits is None or len(self._visits.level) < capacity:
             series, weights = series_of_lanes(self._scenario), self._records[1]["weight"]
-            self._visits = empty_visits(self._start, weights, capacity, series)
+            exchange = pair_exchange(self._scenario, self._kernels, weights)
+            self._visits = empty_visits(self._start, weights, capacity, series, exchange)
         return self._visits
 
     def _begin_estimates(self, instants: Instants, together: int) -> tuple[FloatArray, FloatArray]:

@@ -29,7 +29,6 @@ from netkf.algorithms.kernels.root_flow import (
     use_moments,
     width_of,
 )
-from netkf.algorithms.kernels.square_root import absorb_columns
 from netkf.engines.compiled.events import store_sample
 from netkf.engines.compiled.increments import advance_over_interval, next_interval, noise_index
 from netkf.engines.compiled.lane_readings import (
@@ -45,6 +44,7 @@ from netkf.engines.compiled.lane_series import (
     LaneSeries,
     max_moments,
 )
+from netkf.engines.compiled.pair_exchange import PairExchange, receive, send_both
 from netkf.engines.compiled.state import Filters, Simulation
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
@@ -66,8 +66,8 @@ from netkf.linalg.structs import Struct
 MAX_VISITS = 1 << 14
 """Length of the queue of visits, so that it fits the processor's cache."""
 
-NO_NODE, ALL_NODES, NOT_HEARD, HAS_SENSORS, UNKNOWN = -1, -2, -1, -1, -1
-"""Values in place of an index, see VISIT and Visits; UNKNOWN: no weights are loaded in a lane."""
+NO_NODE, ALL_NODES, NOT_HEARD, HAS_SENSORS = -1, -2, -1, -1
+"""Values in place of an index, see VISIT and Visits."""
 UNOBSERVED, SENSING = 0, 1
 """Both kinds of lanes: of nodes without increment sensors, and of nodes with them."""
 
@@ -115,8 +115,7 @@ class Visits(Struct):
                 ``after_intervals`` - 1
     model : (F,), model of each place, HAS_SENSORS if the node reads increments
     longest : (M,), longest gap in seconds that one step of a model spans
-    weight_row, weight_table : (W,) and (K, 4); row ``weight_row[w]`` holds the own weight and the
-                               message weight of directed link w, and their square roots
+    weight_row : (W,), which of the distinct weights of ``exchange`` each directed link has
 
     The lanes, of nodes without increment sensors (index UNOBSERVED, ``waiting`` of them are in use)
     and with them (SENSING):
@@ -127,10 +126,9 @@ class Visits(Struct):
     columns, values, gains : (W', L), (E, L) and (3 n q, L), the same transposed, by value
     readings : arrays for the readings of sensing nodes
     receiver_places : (2, L), places of the first and second nodes that receive, else NO_NODE
-    in_lanes, loaded_weights : (8, L), weights of both directions, and (2, L), the rows of the table
-                               that they come from
-    x, other_x, moved : (n, L), means
-    S, other_S, V, T : (n, n, L), roots and scratch
+    x, moved : (n, L), means
+    S, old_S, V, T : (n, n, L), roots and scratch
+    exchange : what the nodes of a pair do with each other's messages
     """
 
     records: np.ndarray
@@ -141,12 +139,9 @@ class Visits(Struct):
     model: IntArray
     longest: FloatArray
     weight_row: IntArray
-    weight_table: FloatArray
     lanes: np.ndarray
     places: IntArray
     receiver_places: IntArray
-    loaded_weights: IntArray
-    in_lanes: FloatArray
     unobserved: LaneSeries
     sensing: LaneSeries
     unobserved_rows: FloatArray
@@ -156,12 +151,12 @@ class Visits(Struct):
     values: FloatArray
     gains: FloatArray
     x: FloatArray
-    other_x: FloatArray
     S: FloatArray
-    other_S: FloatArray
+    old_S: FloatArray
     V: FloatArray
     T: FloatArray
     moved: FloatArray
+    exchange: PairExchange
     waiting: int
     count: int
     top: int
@@ -170,25 +165,26 @@ class Visits(Struct):
 
 
 def empty_visits(
-    filters: Filters, weights: FloatArray, places: int, series: tuple[LaneSeries, LaneSeries]
+    filters: Filters,
+    weights: FloatArray,
+    places: int,
+    series: tuple[LaneSeries, LaneSeries],
+    exchange: PairExchange,
 ) -> Visits:
     """Return an empty queue of visits (predictions of one node, or of two that then combine) with
     the arrays to process them, for filters that begin as ``filters``. It has F = ``places`` places,
     rows of the state arrays: N for each of the runs simulated together. ``weights`` (W,) are those
     of W directed links, ``series`` the power series of nodes without increment sensors and with
-    them.
+    them; ``exchange`` is how pairs combine.
     """
     n, capacity = filters.xhat.shape[1], max(MAX_VISITS, 4 * places)
-    # Networks have few distinct weights: lanes look them up in a table, roots included.
-    distinct, weight_row = np.unique(weights, return_inverse=True)
-    own, table = np.maximum(0.0, 1.0 - distinct), filters.table
+    weight_row = np.searchsorted(exchange.weights, weights).astype(np.int64)
+    table = filters.table
     (unobserved, sensing), q = series, max_moments(filters)
     shapes = {
         "gains": (3 * n * q, LANES),
-        **dict.fromkeys(("x", "other_x", "moved"), (n, LANES)),
-        **dict.fromkeys(("S", "other_S", "V", "T"), (n, n, LANES)),
-        # For each direction the own and the message weight, and the roots of both.
-        "in_lanes": (8, LANES),
+        **dict.fromkeys(("x", "moved"), (n, LANES)),
+        **dict.fromkeys(("S", "old_S", "V", "T"), (n, n, LANES)),
     }
     for name, lane_table in (("unobserved", unobserved), ("sensing", sensing)):
         shapes[f"{name}_rows"] = (LANES, lane_table.series.shape[3])
@@ -204,13 +200,12 @@ def empty_visits(
         model=np.tile(model, places // len(nodes)),
         # Column 4 is the first level (a gap of 2^level units) that is longer than all cells.
         longest=table.unit * 2.0 ** table.sizes[:, 4],
-        weight_row=weight_row.astype(np.int64).reshape(-1),
-        weight_table=np.stack([own, distinct, np.sqrt(own), np.sqrt(distinct)], axis=1),
+        weight_row=weight_row,
         readings=empty_readings(filters),
+        exchange=exchange,
         lanes=np.zeros((2, LANES), dtype=LANE),
         places=np.zeros((2, LANES), dtype=np.int64),
         receiver_places=np.zeros((2, LANES), dtype=np.int64),
-        loaded_weights=np.full((2, LANES), UNKNOWN, dtype=np.int64),
         unobserved=unobserved,
         sensing=sensing,
         **{name: with_spare(shape) for name, shape in shapes.items()},
@@ -623,7 +618,7 @@ def predict_lanes(state: Simulation, visits: Visits, reads: bool) -> None:
     """
     size, n, values = state.size, len(state.size), visits.values
     S, V, T = (
-        local_lanes_matrix(size, MANY, visits.other_S),
+        local_lanes_matrix(size, MANY, visits.old_S),
         local_lanes_matrix(size, MANY, visits.V),
         local_lanes_matrix(size, MANY, visits.T),
     )
@@ -650,78 +645,22 @@ def combine_pairs(state: Simulation, visits: Visits, k: int, count: int) -> None
     nodes that exchange estimates), one visit in each of at most L lanes; the nodes that receive the
     other's estimate change in ``state.xhat`` and ``root``.
     """
-    records, places = visits.records, visits.places
-    first_receives, second_receives = False, False
+    exchange, places, receivers = visits.exchange, visits.places, visits.receiver_places
+    for q in range(LANES):
+        receivers[0, q] = receivers[1, q] = NO_NODE
     for q in range(count):
-        visit = records[visits.pairs[k + q]]
+        visit = visits.records[visits.pairs[k + q]]
         places[0, q], places[1, q] = visit.first, visit.second
-        first_receives = (
-            assign_receiver(visits, 0, q, visit.to_first, visit.first) or first_receives
-        )
-        second_receives = (
-            assign_receiver(visits, 1, q, visit.to_second, visit.second) or second_receives
-        )
-    for q in range(count, LANES):
-        visits.receiver_places[0, q] = visits.receiver_places[1, q] = NO_NODE
-    # Both states from before the combination.
-    gather_states(state, places[0], count, visits.x, visits.S)
-    gather_states(state, places[1], count, visits.other_x, visits.other_S)
-    if first_receives:
-        combine_lanes(state, visits, 0, visits.x, visits.S, visits.other_x, visits.other_S)
-        scatter_states(state, visits.receiver_places[0], visits.moved, visits.V)
-    if second_receives:
-        combine_lanes(state, visits, 1, visits.other_x, visits.other_S, visits.x, visits.S)
-        scatter_states(state, visits.receiver_places[1], visits.moved, visits.V)
-
-
-@kernel
-def assign_receiver(visits: Visits, side: int, lane: int, direction: int, place: int) -> bool:
-    """Enter one receiver of a visit, in a ``lane``, for the combination of both nodes: write its
-    ``place`` (row of ``state.xhat``) and the weights of its incoming directed link ``direction``
-    (index) into ``receiver_places`` and ``in_lanes``; ``side`` 0: first node of the visit, 1:
-    second. Return False if it receives nothing (NOT_HEARD).
-    """
-    if direction == NOT_HEARD:
-        visits.receiver_places[side, lane] = NO_NODE
-        return False
-    visits.receiver_places[side, lane] = place
-    weight_row = visits.weight_row[direction]
-    # Mostly all links have one weight, which the lane has already from the visit before.
-    if visits.loaded_weights[side, lane] != weight_row:
-        visits.loaded_weights[side, lane] = weight_row
-        for k in range(4):
-            visits.in_lanes[4 * side + k, lane] = visits.weight_table[weight_row, k]
-    return True
-
-
-@kernel(fused=True)
-def combine_lanes(
-    state: Simulation,
-    visits: Visits,
-    side: int,
-    x: FloatArray,
-    S: FloatArray,
-    other_x: FloatArray,
-    other_S: FloatArray,
-) -> None:
-    """Write the convex combination of paper H (7) and (9) of the estimates in L lanes, w x + w_j
-    x_j (n, L) and the root (n, n, L) of w P + w_j P_j, into ``visits.moved`` and ``visits.V``: of x
-    (n, L) and S (n, n, L), the root of P, with ``other_x`` and ``other_S`` (x_j and the root of
-    P_j), with the weights of ``side`` (0: the first nodes of the visits receive, 1: the second
-    ones).
-    """
-    size, n, values = state.size, len(state.size), visits.in_lanes
-    total, wide = local_lanes_matrix(size, MANY, visits.V), local_lanes_matrix(size, MANY, visits.T)
-    own, weight = load(MANY, values, 4 * side), load(MANY, values, 4 * side + 1)
-    own_root, root = load(MANY, values, 4 * side + 2), load(MANY, values, 4 * side + 3)
-    for i in range(n):
-        combined = own * load(MANY, x, i) + weight * load(MANY, other_x, i)
-        store(MANY, visits.moved, i, combined)
-        for j in range(i + 1):
-            store(MANY, total, i, j, own_root * load(MANY, S, i, j))
-            store(MANY, wide, i, j, root * load(MANY, other_S, i, j))
-    # The root of w P + w_j P_j from the columns of both roots: nothing is subtracted.
-    absorb_columns(MANY, size, total, wide)
-    for i in range(n):
-        for j in range(i + 1):
-            store(MANY, visits.V, i, j, load(MANY, total, i, j))
+        if visit.to_first != NOT_HEARD:
+            receivers[0, q] = visit.first
+            exchange.weight_row[0, q] = visits.weight_row[visit.to_first]
+        if visit.to_second != NOT_HEARD:
+            receivers[1, q] = visit.second
+            exchange.weight_row[1, q] = visits.weight_row[visit.to_second]
+    # Both send what they knew before.
+    for side in range(2):
+        gather_states(state, places[side], count, exchange.xhat[side], exchange.root[side])
+    send_both(exchange)
+    for side in range(2):
+        if receive(exchange, side, receivers[side]):
+            scatter_states(state, receivers[side], exchange.xhat[side], exchange.root[side])
