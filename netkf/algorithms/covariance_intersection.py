@@ -19,8 +19,11 @@ from netkf.algorithms.traits import Needs
 def covariance_intersection_record(
     _: Any, infos: Sequence[NodeInfo], models: Sequence[Any]
 ) -> Record:
-    """Return the record of the diffusion filter with ``on_loss = "keep-own"``."""
-    return diffusion_filter_record(DiffusionFilter(on_loss="keep-own"), infos, models)
+    """Return the record of the diffusion filter with ``on_loss = "keep-own"``, by which the weight
+    of all that arrives decides the own one.
+    """
+    record = diffusion_filter_record(DiffusionFilter(on_loss="keep-own"), infos, models)
+    return replace(record, transient=("own", "inverse"))
 
 
 @built_in("covariance-intersection")
@@ -40,7 +43,6 @@ class CovarianceIntersection(Hybrid):
         record=covariance_intersection_record,
         begin=begin_estimate,
         unrolled=True,
-        on_estimates=(DiffusionFilter.kernels.emit, DiffusionFilter.kernels.absorb),
     )
 
     shift = Filter.shift  # affine: the weights sum to one

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from netkf.algorithms.filter import Filter
-from netkf.algorithms.kernels import run as standard
 from netkf.algorithms.kernels.run import carry, copy_estimate
 from netkf.algorithms.records import Kernels
 from netkf.algorithms.registry import built_in
@@ -40,6 +39,6 @@ class Gossip(Filter):
     timing = Timing(
         schedule=("exchange", "sense", "predict"), clocks=("links",), predicts=True, pairwise=True
     )
-    kernels = Kernels(absorb=swap, unrolled=True, on_estimates=(standard.emit, swap))
+    kernels = Kernels(absorb=swap, unrolled=True)
 
     shift = Filter.shift  # affine in readings and messages

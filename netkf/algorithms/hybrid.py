@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from netkf.algorithms.filter import Filter
-from netkf.algorithms.kernels import run as standard
 from netkf.algorithms.kernels.neighbours import combine_convex
 from netkf.algorithms.records import Kernels
 from netkf.algorithms.registry import built_in
@@ -31,9 +30,7 @@ class Hybrid(Filter):
 
     analysis = Analysis(paper="hybrid", P_by_design=("", "larger"))
     timing = Timing(schedule=None)
-    kernels = Kernels(
-        absorb=combine_convex, unrolled=True, on_estimates=(standard.emit, combine_convex)
-    )
+    kernels = Kernels(absorb=combine_convex, unrolled=True)
 
     @property
     def link_weights(self) -> Weights:

@@ -31,6 +31,7 @@ class Record:
     """The arrays of a filter besides ``xhat`` (n,) and ``root`` (n, n) of each node.
 
     node : shapes of what each node knows, by name
+    transient : names of those of them whose values mean nothing to later events
     past : shapes of what a node keeps of each of its past events, such as the readings that it has
            used: arrays (H, E, *shape, L), of which the first ``kept`` (H, L) entries of a node
            count, which kernels set. Engines make E (``room``) larger where ``update``, ``shift`` or
@@ -43,6 +44,7 @@ class Record:
     """
 
     node: Shapes = field(default_factory=dict)
+    transient: tuple[str, ...] = ()
     past: Shapes = field(default_factory=dict)
     link: Shapes = field(default_factory=dict)
     link_start: Mapping[str, Any] = field(default_factory=dict)
@@ -99,8 +101,6 @@ class Kernels:
     unrolled : kernels are compiled for each n up to 4 with unrolled loops: only where that makes
                runs a tenth faster
     under_clocks : the verbs under clocks, where they are others than in slots; the record is one
-    on_estimates : (emit, absorb) where these use nothing but estimates and the weights of messages;
-                   it no longer holds where one of them is replaced
     means : names of the arrays of estimates, in the record and in payloads
     depends_on_data : whether who sends depends on readings or estimates; by default ``decides``
     """
@@ -124,7 +124,6 @@ class Kernels:
     addressed: bool = False
     unrolled: bool = False
     under_clocks: Kernels | None = None
-    on_estimates: tuple[Any, ...] = ()
     means: tuple[str, ...] = ("xhat",)
     depends_on_data: bool | None = None
 
@@ -143,15 +142,7 @@ class Kernels:
     @property
     def is_convex(self) -> bool:
         """True if nodes are Kalman filters that form convex combinations, and nothing else."""
-        plain = replace(self, unrolled=False, on_estimates=())
-        return plain == Kernels(absorb=combine_convex)
-
-    @property
-    def exchanges_estimates(self) -> bool:
-        """True if nodes are Kalman filters whose exchanges depend on both estimates alone."""
-        own = ("record", "emit", "absorb", "unrolled", "on_estimates")
-        others = Kernels(**{name: getattr(self, name) for name in own})
-        return self == others and self.on_estimates == (self.emit, self.absorb)
+        return replace(self, unrolled=False) == Kernels(absorb=combine_convex)
 
     def of(self, clocked: bool) -> Kernels:
         """Return the verbs under clocks, or in slots."""

@@ -22,7 +22,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from netkf.algorithms.filter import Filter, NodeInfo
-from netkf.algorithms.kernels import run as standard
 from netkf.algorithms.kernels.pair_fusion import fuse_pair
 from netkf.algorithms.kernels.run import (
     carry,
@@ -120,11 +119,7 @@ class PairFusion(Filter):
     analysis = Analysis(paper="track_fusion")
     needs = Needs(one_way=True, inverts=True)
     inverse: ClassVar[bool] = False
-    kernels = Kernels(
-        absorb=fuse_heard,
-        record=pair_fusion_record,
-        on_estimates=(standard.emit, fuse_heard),
-    )
+    kernels = Kernels(absorb=fuse_heard, record=pair_fusion_record)
 
     shift = Filter.shift  # affine: the gains of both estimates sum to I, and only P decides them
 

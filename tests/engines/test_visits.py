@@ -10,7 +10,10 @@ import scipy.linalg
 
 import netkf
 from netkf.algorithms.gossip import swap
+from netkf.algorithms.kernels import run as standard
 from netkf.algorithms.kernels.root_flow import cell_of
+from netkf.algorithms.records import Record, estimate_shapes
+from netkf.algorithms.traits import Weights
 from netkf.engines.compiled import agenda, batches, flow, visits
 from netkf.engines.compiled.flow import Workspace
 from netkf.engines.compiled.lane_series import NEAR
@@ -103,6 +106,10 @@ def test_company_does_not_matter(ring, monkeypatch, name):
 
 
 def test_only_runs_whose_messages_take_no_time(ring):
+    diffusion = {"kind": "diffusion", "weights": "metropolis"}  # own weights differ by node
+    at = {"network.activation": {"kind": "poisson", "rate": 1.0, "at": "nodes"}}
+    assert agenda.is_immediate(ring.replace(at))
+    assert not agenda.is_immediate(ring.replace({**at, "filter": diffusion}))
     assert agenda.is_immediate(ring)
     apart = (
         {"kind": "periodic", "period": 0.5, "phase": "random"},
@@ -115,7 +122,6 @@ def test_only_runs_whose_messages_take_no_time(ring):
         {"network.activation": {"kind": "renewal", "distribution": "constant", "mean": 0.5}},
         {"network.channel.delay": {"kind": "constant", "seconds": 0.1}},
         {"network.activation": {"kind": "periodic", "period": 0.5}},
-        {"filter": {"kind": "covariance-intersection", "epsilon": 0.3}},
         {"filter": {"kind": "local"}},
         {"sensors.0.sampling": {"kind": "periodic", "period": 0.5}},
     ):
@@ -177,9 +183,90 @@ class Swaps(Hybrid):
     shift = Filter.shift
 
 
-def test_verbs_and_not_the_class_say_what_runs_in_lanes(ring):
-    filtering = dataclasses.replace(ring.filter, algorithm=Swaps(epsilon=0.3))
-    own = dataclasses.replace(ring, filter=filtering)
-    assert agenda.is_immediate(ring)
-    assert not agenda.is_immediate(own)
+@kernel
+def trust_late_ones(record, h, run):
+    """Halve the estimate, where time has passed."""
+    for i in range(len(run.size)):
+        record.xhat[h, i, 0] *= 1.0 if run.gap == 0.0 else 0.5
+
+
+@kernel
+def swap_and_wait(record, h, run):
+    """Swap, and then do what depends on more than estimates."""
+    swap(record, h, run)
+    trust_late_ones(record, h, run)
+
+
+@kernel
+def count(record, h, run):
+    """Swap, and count the swaps."""
+    swap(record, h, run)
+    record.swaps[h, 0] += 1.0
+
+
+def counting_record(_filtering, _infos, models):
+    return Record(payload=estimate_shapes(len(models[0].information)), node={"swaps": ()})
+
+
+def with_filter(scenario, algorithm):
+    return dataclasses.replace(
+        scenario, filter=dataclasses.replace(scenario.filter, algorithm=algorithm)
+    )
+
+
+def test_verbs_and_not_the_class_say_what_runs_in_lanes(ring, monkeypatch):
+    own = with_filter(ring, Swaps(epsilon=0.3))
+    assert agenda.is_immediate(own)
     assert_agree(own.replace({"horizon": 3.0}))
+    for kernels in (
+        Kernels(absorb=swap_and_wait),
+        Kernels(absorb=count, record=counting_record),
+        Kernels(absorb=swap, update=standard.absorb),
+        Kernels(absorb=swap, begin=lambda *_: None),
+    ):
+        monkeypatch.setattr(Swaps, "kernels", kernels)
+        assert not agenda.is_immediate(with_filter(ring, Swaps(epsilon=0.3)))
+
+
+OTHERS = {
+    "gossip": {"kind": "gossip"},
+    "intersection": {"kind": "covariance-intersection", "epsilon": 0.2},
+    "best weight": {"kind": "track-fusion", "rule": "ci"},
+}
+
+
+@pytest.mark.one_in(3)
+@pytest.mark.parametrize("each_way", [False, True])
+@pytest.mark.parametrize("name", OTHERS)
+def test_other_filters_that_exchange_estimates(ring, monkeypatch, name, each_way):
+    case = ring.replace(
+        {"horizon": 8.0, "filter": OTHERS[name], "network.channel.symmetric": not each_way}
+    )
+    assert_close(case, monkeypatch)
+    (batch,) = batches.flow_batches(case, 5, range(5))
+    alone = netkf.simulate(case, 5, replica=3, engine="compiled")
+    np.testing.assert_array_equal(batch.P[3], alone.P)
+    np.testing.assert_array_equal(batch.xhat[3], alone.xhat)
+
+
+UNEQUAL = np.array([[0.5, 0.3, 0.1], [0.2, 0.6, 0.25], [0.3, 0.1, 0.65]])
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Unequal(Hybrid):
+    """A hybrid filter whose links have weights of their own."""
+
+    shift = Filter.shift
+
+    @property
+    def link_weights(self):
+        return Weights(matrix=UNEQUAL)
+
+
+def test_messages_in_one_register_have_different_weights(build):
+    graph = {"kind": "complete", "nodes": 3}
+    network = {"graph": graph, "activation": {"kind": "poisson", "rate": 2.0}}
+    case = build(horizon=6.0, network=network)
+    case = with_filter(case, Unequal(epsilon=0.3))
+    assert agenda.is_immediate(case)
+    assert_agree(case)

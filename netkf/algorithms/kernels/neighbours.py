@@ -12,6 +12,7 @@ from netkf.algorithms.kernels.run import carry, use_reading
 from netkf.algorithms.kernels.square_root import absorb_columns
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import load, load_flags, root_of, select, spread, store
+from netkf.linalg.local import local_lanes_matrix
 
 
 @kernel(inlined=True)
@@ -31,6 +32,7 @@ def combine_convex(record: Any, h: int, run: Any) -> None:
     ``P = sum w_j P_j``.
     """
     lanes, n, root, payload = run.lanes, len(run.size), record.root, record.payload
+    theirs = local_lanes_matrix(run.size, lanes, run.noise)
     # Rounding may leave the own weight a little below 0, which has no root.
     own = 1.0 - received_weight(run)
     factor = root_of(select(own > 0.0, own, 0.0))
@@ -47,10 +49,10 @@ def combine_convex(record: Any, h: int, run: Any) -> None:
         # P + w P_j = A A' with A = [S, sqrt(w) S_j].
         for i in range(n):
             for j in range(i + 1):
-                store(lanes, run.noise, i, j, factor * load(lanes, payload.root, m, i, j))
+                store(lanes, theirs, i, j, factor * load(lanes, payload.root, m, i, j))
             difference = load(lanes, payload.xhat, m, i) - load(lanes, record.xhat, h, i)
             store(lanes, run.moved_mean, i, load(lanes, run.moved_mean, i) + weight * difference)
-        absorb_columns(lanes, run.size, root[h], run.noise)
+        absorb_columns(lanes, run.size, root[h], theirs)
     for i in range(n):
         mean = load(lanes, record.xhat, h, i) + load(lanes, run.moved_mean, i)
         store(lanes, record.xhat, h, i, mean)

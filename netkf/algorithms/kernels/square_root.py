@@ -16,6 +16,7 @@ from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import Lanes, load, magnitude, root_of, select, spread, store
 from netkf.linalg.structs import Size
 
+NEGLIGIBLE = 1e-40  # share of a squared pivot that changes neither it nor the rows below it
 TINY = 1e-300  # below any squared length of a row that counts, yet above underflow
 NEGLIGIBLE = 1e-40  # share of a squared pivot that changes neither it nor the rows below it
 

@@ -11,6 +11,7 @@ from functools import cache
 
 import numpy as np
 
+from netkf.algorithms.exchanges import exchanges_estimates
 from netkf.algorithms.filter import compiled_kernels
 from netkf.engines.compiled.batch_arrays import BatchArrays, begin, finish, no_batch, reset_filters
 from netkf.engines.compiled.events import (
@@ -40,6 +41,7 @@ from netkf.engines.compiled.events import (
 )
 from netkf.engines.compiled.message_queue import sort_indices
 from netkf.engines.compiled.outcomes import delay_is_zero
+from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.senders import senders_of
 from netkf.engines.compiled.state import LINKS, NODES, Simulation
 from netkf.engines.compiled.ticks import ticks_apart
@@ -81,6 +83,7 @@ PROGRESS = np.dtype([(name, np.int64) for name in _POSITIONS])
 """The position of a run that is interrupted, see Simulation."""
 
 
+@once_per_scenario
 def is_immediate(scenario: Scenario) -> bool:
     """Return True if filters of a scenario can be simulated in SIMD lanes, as many nodes side by
     side as a vector register holds: exchanges of estimates alone, messages without delay, clocks
@@ -91,7 +94,6 @@ def is_immediate(scenario: Scenario) -> bool:
     kernels = compiled_kernels(node_filter, clocked=True)
     return (
         kernels is not None
-        and kernels.exchanges_estimates
         and node_filter.timing.talks
         and scenario.views is None
         and scenario.plant.linear
@@ -107,6 +109,10 @@ def is_immediate(scenario: Scenario) -> bool:
         and node_filter.timing.max_age >= 0.0
         # Each message of a tick has a bit of one integer.
         and int(np.diff(senders_of(scenario).first).max(initial=0)) <= MAX_LINKS_OF_CLOCK
+        and exchanges_estimates(
+            kernels,
+            kernels.record(node_filter, scenario.node_infos, scenario.model_pieces[0]),
+        )
     )
 
 
