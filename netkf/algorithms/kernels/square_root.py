@@ -18,7 +18,6 @@ from netkf.linalg.structs import Size
 
 NEGLIGIBLE = 1e-40  # share of a squared pivot that changes neither it nor the rows below it
 TINY = 1e-300  # below any squared length of a row that counts, yet above underflow
-NEGLIGIBLE = 1e-40  # share of a squared pivot that changes neither it nor the rows below it
 
 
 def lower_triangular(array: FloatArray) -> FloatArray:
