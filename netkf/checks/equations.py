@@ -123,12 +123,15 @@ def summarise_drift(scenario: Scenario, run: Run) -> ReplicaSummary:
 
 
 def _promises_under_clocks(scenario: Scenario) -> tuple[Promise, ...]:
-    conserved = with_promised_filter(scenario).node_filter.analysis.conserved
+    analysis, design = with_promised_filter(scenario).node_filter.analysis, design_of(scenario)
+    conserved = analysis.conserved
     # In slots mass is lost with messages, as P says, and who is down hears none; P may count
     # readings of who is down, or one reading several times.
     sleepy = scenario.slotted and bool(scenario.network.lives)
     mass = () if conserved is nothing_conserved or sleepy else (MASS_CONSERVED,)
-    bound = () if design_of(scenario) == "smaller" or sleepy else (UPPER_BOUND,)
+    # P of other papers' filters may leave something out (kcf), or is proved of one fusion (ici).
+    proved = design in ("larger", "equal") or analysis.paper in ("", "gossip", "intermittent")
+    bound = (UPPER_BOUND,) if proved and design != "smaller" and not sleepy else ()
     unjudged = unjudged_line(scenario)
     left_out = Promise(
         "errors of all blocks have a known law", "netkf", (), lambda *_: find_unknown(unjudged)

@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm, solve_discrete_are
 
 import netkf
+from netkf.checks.check import find_checks
 from netkf.core.errors import TheoryError
 from netkf.theory.promises import compute_promises, promises_text
 from tests.engines.test_changes import (
@@ -197,6 +198,17 @@ def test_filters_that_do_not_know_are_said_to_be_wrong():
     assert (unaware.table["expected"] > 4.0).all()
     assert (unaware.table["nees"] > 4.0).all()
     np.testing.assert_allclose(aware.table["expected"], 2.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["kcf", "diffusion-kalman"])
+def test_check_promises_no_bound_that_no_paper_proves(kind):
+    s = slots(kind)
+    run = netkf.simulate(s, engine="simpy")
+    lacking = run.P - netkf.theory.error_covariance(s, run)
+    assert np.linalg.eigvalsh(lacking).min() < -1e-3
+    promises = [one.statement for one in find_checks(s).promises(s)]
+    assert "P follows the equations along the events of each run" in promises
+    assert "P is at least the covariance of the error, given the events" not in promises
 
 
 @pytest.mark.one_in(2)
