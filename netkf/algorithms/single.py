@@ -12,21 +12,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from netkf.algorithms.kernels.at_rest import run_at_rest
 from netkf.algorithms.kernels.gains import stack_gains
-from netkf.algorithms.kernels.gates import no_gate
 from netkf.algorithms.kernels.maps import SingleMapRun
-from netkf.algorithms.kernels.nonlinear_rows import no_nonlinear
-from netkf.algorithms.kernels.pairs import no_pairs
 from netkf.algorithms.kernels.rates import RateRun
 from netkf.algorithms.kernels.root_flow import stack_tables
 from netkf.algorithms.kernels.run import (
-    ALIKE,
-    ALL,
     ClockRun,
     SingleSlotRun,
     SlotTables,
     clock_tables,
-    scratch_of,
     size_of,
 )
 from netkf.algorithms.models import (
@@ -188,7 +183,11 @@ class Surroundings:
         size, cls = size_of(n, unrolled=False), _run_class(model)
         degree = max(1, info.degree, len(info.senders))
         self.links = {sender: k for k, sender in enumerate(info.senders)}
+        fields = run_at_rest(n, 1, degree)
+        if self._pairs is not None:
+            fields["pairs"] = self._pairs.none()
         self.struct = cls(
+            **fields | {"message": np.arange(degree)},
             size=size,
             lanes=ONE,
             model=_tables_of(model, size),
@@ -200,29 +199,6 @@ class Surroundings:
             H=np.zeros((1, 1, n if self._pairs is None else self._pairs.columns, 1)),
             rows=np.zeros(1, dtype=np.int64),
             matrix=np.arange(1),
-            message=np.arange(degree),
-            link=np.zeros(degree, dtype=np.int64),
-            message_weight=np.zeros(degree),
-            age=np.zeros(degree),
-            heard=np.full(degree, -1),
-            arrived=np.ones((degree, 1), dtype=np.uint8),
-            sends=np.ones(1, dtype=np.uint8),
-            uniform=np.zeros(1),
-            common=ALIKE,
-            pairs=no_pairs() if self._pairs is None else self._pairs.none(),
-            nonlinear=no_nonlinear(),
-            gate=no_gate(),
-            reading=OWN,
-            first_y=0,
-            first_H=0,
-            count=0,
-            receiver=ALL,
-            slot=-1,
-            phase=-1,
-            step=-1,
-            gap=0.0,
-            now=0.0,
-            **scratch_of(n, 1),
         )
 
     def follow(self) -> None:

@@ -8,16 +8,15 @@ from typing import Any
 
 import numpy as np
 
+from netkf.algorithms.kernels.at_rest import run_at_rest
 from netkf.algorithms.kernels.gates import GateTables, gate_tables, no_gate
-from netkf.algorithms.kernels.nonlinear_rows import linear_rows, no_nonlinear
+from netkf.algorithms.kernels.nonlinear_rows import linear_rows
 from netkf.algorithms.kernels.pairs import no_pairs, pairs_of
 from netkf.algorithms.kernels.rates import RateRun
 from netkf.algorithms.kernels.run import (
-    ALL,
     ClockRun,
     clock_tables,
     opposite_links,
-    scratch_of,
     size_of,
 )
 from netkf.algorithms.models import RateModel, changing_models
@@ -108,7 +107,9 @@ class ClockFilters:
         n, unrolled = start.xhat.shape[1], self.kernels.unrolled and scenario.views is None
         size = size_of(n, unrolled and not self._rates)
         cls = ClockRun.of_size(n) if isinstance(size, tuple) else ClockRun
+        own = {**links, **self._inbox(messages), "common": self._common}
         made = cls(
+            **run_at_rest(n, 1, messages) | own,
             size=size,
             lanes=ONE,
             model=clock_tables(
@@ -118,23 +119,6 @@ class ClockFilters:
                 start.gains,
                 np.array(scenario.followed_changes),
             ),
-            **links,
-            **self._inbox(messages),
-            sends=np.ones(1, dtype=np.uint8),
-            uniform=np.zeros(1),
-            common=self._common,
-            nonlinear=no_nonlinear(),
-            reading=0,
-            first_y=0,
-            first_H=0,
-            count=0,
-            receiver=ALL,
-            slot=-1,
-            phase=-1,
-            step=-1,
-            gap=0.0,
-            now=0.0,
-            **scratch_of(n, 1),
         )
         if not self._rates:
             return made

@@ -10,15 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.kernels.gates import no_gate
-from netkf.algorithms.kernels.nonlinear_rows import no_nonlinear
-from netkf.algorithms.kernels.pairs import no_pairs
-from netkf.algorithms.kernels.run import ALIKE, ALL, SlotRun, SlotTables, scratch_of, size_of
+from netkf.algorithms.kernels.at_rest import run_at_rest
+from netkf.algorithms.kernels.run import SlotRun, SlotTables, size_of
 from netkf.algorithms.records import Kernels, make_records
 from netkf.linalg.addresses import AnyStruct, address_of, any_struct, call_at, call_at_two
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import LANES, MANY, aligned, with_spare
+from netkf.linalg.lanes import LANES, MANY, with_spare
 from netkf.linalg.structs import Struct
 from netkf.scenario.scenario import Scenario
 
@@ -85,6 +83,7 @@ def _run_of_pairs(n: int, unrolled: bool) -> Any:
     size = size_of(n, unrolled)
     cls = SlotRun.of_size(n) if isinstance(size, tuple) else SlotRun
     return cls(
+        **run_at_rest(n, LANES, 1) | {"count": 1},
         size=size,
         lanes=MANY,
         # Messages take no time: nothing is predicted.
@@ -97,29 +96,6 @@ def _run_of_pairs(n: int, unrolled: bool) -> Any:
         H=np.zeros((1, 1, 1, LANES)),
         rows=np.zeros(1, dtype=np.int64),
         matrix=np.zeros(2, dtype=np.int64),
-        message=np.zeros(1, dtype=np.int64),
-        link=np.zeros(1, dtype=np.int64),
-        message_weight=np.zeros(1),
-        age=np.zeros(1),
-        heard=np.full(1, -1),
-        arrived=aligned((1, LANES), np.uint8),
-        sends=aligned((LANES,), np.uint8),
-        uniform=aligned((LANES,)),
-        common=ALIKE,
-        pairs=no_pairs(),
-        nonlinear=no_nonlinear(),
-        gate=no_gate(),
-        reading=0,
-        first_y=0,
-        first_H=0,
-        count=1,
-        receiver=ALL,
-        slot=-1,
-        phase=-1,
-        step=-1,
-        gap=0.0,
-        now=0.0,
-        **scratch_of(n, LANES),
     )
 
 

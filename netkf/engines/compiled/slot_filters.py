@@ -9,16 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.kernels.gates import gate_tables, no_gate
+from netkf.algorithms.kernels.at_rest import run_at_rest
+from netkf.algorithms.kernels.gates import gate_tables
 from netkf.algorithms.kernels.maps import MapRun
-from netkf.algorithms.kernels.nonlinear_rows import no_nonlinear
 from netkf.algorithms.kernels.pairs import Pairs, no_pairs
 from netkf.algorithms.kernels.run import (
-    ALL,
     Estimates,
     SlotRun,
     SlotTables,
-    scratch_of,
     size_of,
 )
 from netkf.algorithms.models import MapModel, changing_models
@@ -106,15 +104,17 @@ class SlotFilters:
 
     def _run_of(self, pairs: Pairs, active: int) -> Any:
         """Return what surrounds the nodes, before any slot."""
-        setup, n, gate = self._setup, self._setup.width, no_gate()
-        if setup.gate is not None:
-            gate = gate_tables(setup.gate, n, (LANES, active), setup.gated_parts)
+        setup, n = self._setup, self._setup.width
         size = size_of(n, self.kernels.unrolled)
         cls: Any = MapRun if isinstance(setup.models[0], MapModel) else SlotRun
         cls = cls.of_size(n) if isinstance(size, tuple) else cls
         # Inbox: a node hears at most all of its links.
         most = max(1, int(np.diff(setup.links.first).max(initial=0)))
+        own = {"common": setup.common, "pairs": pairs, "gap": setup.period}
+        if setup.gate is not None:
+            own["gate"] = gate_tables(setup.gate, n, (LANES, active), setup.gated_parts)
         return cls(
+            **run_at_rest(n, LANES, most) | own,
             size=size,
             lanes=MANY,
             model=self._models[0],
@@ -126,29 +126,6 @@ class SlotFilters:
             H=np.zeros((1, 1, 1, LANES)),
             rows=setup.rows,
             matrix=np.arange(setup.estimators),
-            message=np.zeros(most, dtype=np.int64),
-            link=np.zeros(most, dtype=np.int64),
-            message_weight=np.zeros(most),
-            age=np.zeros(most),
-            heard=np.zeros(most, dtype=np.int64),
-            arrived=aligned((most, LANES), np.uint8),
-            sends=aligned((LANES,), np.uint8),
-            uniform=aligned((LANES,)),
-            common=setup.common,
-            pairs=pairs,
-            nonlinear=no_nonlinear(),
-            gate=gate,
-            reading=0,
-            first_y=0,
-            first_H=0,
-            count=0,
-            receiver=ALL,
-            slot=0,
-            phase=0,
-            step=0,
-            gap=setup.period,
-            now=0.0,
-            **scratch_of(n, LANES),
         )
 
     def _lay_out_stages(self) -> None:
