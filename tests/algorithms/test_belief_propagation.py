@@ -102,6 +102,7 @@ def test_as_many_steps_as_the_tree_is_wide_are_the_central_filter(tmp_path):
     assert (size < right - 1e-3).all()
 
 
+@pytest.mark.slow
 @pytest.mark.one_in(4)
 @pytest.mark.parametrize("memory", ["slot", "all"])
 @pytest.mark.parametrize("graph", [TREE, RING["graph"]], ids=["tree", "ring"])

@@ -167,6 +167,7 @@ PAIR = {
 }
 
 
+@pytest.mark.slow
 def test_two_tracks_have_the_cross_covariance_of_a_lyapunov_equation(tmp_path):
     """Bar-Shalom and Campo (1986): P12 of steady filters, and the fused covariance."""
     sensors = [

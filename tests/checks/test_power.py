@@ -82,6 +82,7 @@ def test_what_no_test_could_find_is_stated(ring):
     assert scipy.stats.poisson(ticks * (1.0 + 0.8 * least)).sf(limit) < 0.9
 
 
+@pytest.mark.slow
 def test_errors_have_the_freedom_to_find_five_per_cent(ring):
     scenario, results = ring
     joint = np.array([one.summary.joint for one in results])

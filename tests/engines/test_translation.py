@@ -242,6 +242,7 @@ class AffineTuples(tuples.Tuples):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.one_in(2)
 @pytest.mark.parametrize("kind", ["affine:Affine", "affine:AffineTuples"])
 def test_errors_of_translated_messages_are_exact(folder: Path, kind: str) -> None:

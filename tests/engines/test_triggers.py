@@ -111,6 +111,7 @@ def test_links_of_one_direction(name, tmp_path):
     assert_batch(scenario)
 
 
+@pytest.mark.slow
 @pytest.mark.one_in(16)
 @pytest.mark.parametrize("name", with_slow(INNER, {"belief-propagation", "cross-covariance"}))
 def test_frames_of_unstable_plants(name, tmp_path):

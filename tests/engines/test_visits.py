@@ -179,7 +179,7 @@ def test_tables_of_lanes_hold_transitions_and_gains(ring, case):
 class Swaps(Hybrid):
     """A hybrid filter by name that swaps estimates."""
 
-    kernels = Kernels(absorb=swap)
+    kernels = Kernels(absorb=swap, unrolled=True)
     shift = Filter.shift
 
 

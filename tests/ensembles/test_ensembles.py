@@ -225,6 +225,7 @@ def test_a_worker_that_dies_is_replaced_and_its_runs_are_done_once(short, tmp_pa
     assert (tmp_path / "mark").exists()
 
 
+@pytest.mark.slow
 def test_workers_that_die_again_and_again_end_in_one_line(short):
     with pytest.raises(netkf.EngineError, match="workers ended again and again"):
         replicate(dies, short, 2, pool=PoolOptions(2))

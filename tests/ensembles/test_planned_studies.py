@@ -83,6 +83,7 @@ def test_parts_of_a_study_are_the_study(name, tmp_path, capsys):
     assert "0 runs simulated; nothing is left to do" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_search_goes_round_by_round(tmp_path, capsys):
     plan = tmp_path / "plan"
     status = main([*SIZE, "--workers", "1"])
@@ -319,7 +320,7 @@ def test_results_are_found_where_another_worker_has_merged_them(as_list, tmp_pat
     found = reader.load((2, 2))
     assert (found if as_list else found.values.tolist()) == [4, 9]
     shutil.rmtree(tmp_path)
-    with pytest.raises(EngineError, match="which does it again"):
+    with pytest.raises(EngineError, match="give the same command again"):
         reader.load((2, 2))
 
 

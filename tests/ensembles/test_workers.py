@@ -95,7 +95,7 @@ RUN = ["run", RING, "--runs", "9999", "--trace", "full", "--no-plot"]
 @pytest.mark.parametrize(
     ("number", "group"),
     [
-        (signal.SIGTERM, False),
+        pytest.param(signal.SIGTERM, False, marks=pytest.mark.slow),
         pytest.param(signal.SIGTERM, True, marks=pytest.mark.slow),
         (signal.SIGINT, True),
     ],

@@ -352,7 +352,7 @@ TICKS = {"kind": "poisson", "rate": 9.0, "at": "nodes"}
 HOLES = "t,node,x0,x1,x2\n0,1,0,0,3\n0,2,3,4,-1\n1,1,0,0,3\n1,2,3,4,-1\n"
 
 
-@pytest.mark.parametrize("time", [None, FLOW])
+@pytest.mark.parametrize("time", [None, pytest.param(FLOW, marks=pytest.mark.slow)])
 def test_positions_are_asked_for_whenever_messages_are_sent(tmp_path, time):
     table = team(tmp_path, time, position=[0, 1], input=RECORDED)
     table["network"]["channel"] = {"loss": LOSS}

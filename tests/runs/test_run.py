@@ -12,7 +12,7 @@ from netkf.cli.main import main
 from netkf.engines.simpy.engine import SimpyEngine
 from netkf.runs.files import create_output_directory, write_atomically
 from netkf.runs.run import run_to_directory
-from tests.conftest import SCENARIOS, scenario_files
+from tests.conftest import SCENARIOS, scenario_files, with_slow
 
 
 @pytest.fixture
@@ -342,7 +342,13 @@ OTHERS = [SCENARIOS / "nonlinear" / "range_tracking.toml"]
 OTHERS += sorted((SCENARIOS / "blocks").glob("*.toml"))
 
 
-@pytest.mark.parametrize("file", [*scenario_files(), *OTHERS], ids=lambda f: f.stem)
+LONG = [SCENARIOS / "intel_lab.toml"]
+"""Its event loop is compiled for nothing else."""
+
+
+@pytest.mark.parametrize(
+    "file", with_slow([*scenario_files(), *OTHERS], LONG), ids=lambda f: f.stem
+)
 def test_every_scenario_ends_in_its_expected_summary(file, tmp_path, capsys):
     """The file beside the scenario; numbers to 6 digits, counts exactly."""
     options = ["--out", str(tmp_path / "out"), "--no-plot"]

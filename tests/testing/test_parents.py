@@ -158,6 +158,7 @@ def test_an_adjustment_that_changes_numbers_is_named(name):
     assert compare(cls, settings, same_as_parent=False) is None
 
 
+@pytest.mark.slow
 @pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", DEFINED)
 def test_a_step_that_differs_is_told_and_accused_where_it_should_be_the_same(name):

@@ -13,6 +13,7 @@ import numpy as np
 
 from netkf.algorithms.exchanges import exchanges_estimates
 from netkf.algorithms.filter import compiled_kernels
+from netkf.algorithms.records import Record
 from netkf.engines.compiled.batch_arrays import BatchArrays, begin, finish, no_batch, reset_filters
 from netkf.engines.compiled.events import (
     ABSORB,
@@ -109,11 +110,15 @@ def is_immediate(scenario: Scenario) -> bool:
         and node_filter.timing.max_age >= 0.0
         # Each message of a tick has a bit of one integer.
         and int(np.diff(senders_of(scenario).first).max(initial=0)) <= MAX_LINKS_OF_CLOCK
-        and exchanges_estimates(
-            kernels,
-            kernels.record(node_filter, scenario.node_infos, scenario.model_pieces[0]),
-        )
+        and exchanges_estimates(kernels, _record_of(scenario))
     )
+
+
+def _record_of(scenario: Scenario) -> Record:
+    kernels, infos = scenario.node_filter.kernels, scenario.node_infos
+    assert kernels is not None
+    # That of the filter, also where it has other verbs under clocks.
+    return kernels.record(scenario.node_filter, infos, scenario.model_pieces[0])
 
 
 def together(nodes: int, runs: int) -> int:
