@@ -75,7 +75,7 @@ def assert_batch(scenario, runs=9):
     return batch
 
 
-LONG = ("belief-propagation", "cross-covariance", "hcmci", "consensus")
+LONG = ("belief-propagation", "cross-covariance", "hcmci", "consensus", "push-sum")
 """Inner filters that take long to compile, and are compiled without a trigger anyway."""
 
 

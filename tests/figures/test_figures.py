@@ -73,7 +73,7 @@ def drawing(results):
     return of
 
 
-@pytest.mark.one_in(14)
+@pytest.mark.one_in(16)
 @pytest.mark.parametrize("name", FIGURES)
 @pytest.mark.parametrize("kind", with_slow(KINDS, {"no samples", "interrupted", "diverged"}))
 def test_text_neither_overlaps_nor_leaves_the_canvas(drawing, kind, name):

@@ -181,7 +181,11 @@ def test_errors_of_local_filters_of_blocks_are_jointly_those_of_kalman_filters(
     assert not last[~known].any()
 
 
-@pytest.mark.parametrize("text", [ROBOTS, CLOCKED], ids=["slots", "clocks"])
+@pytest.mark.parametrize(
+    "text",
+    [ROBOTS, pytest.param(CLOCKED, marks=pytest.mark.slow)],
+    ids=["slots", "clocks"],
+)
 def test_blocks_that_change_and_whose_input_is_not_known(tmp_path: Path, text: str) -> None:
     changed = "F = [[1.1]]" if text == ROBOTS else "A = [[0.2]]"
     G = 'input = { kind = "constant", G = [[1.0]], value = [0.4] }\ncov = [[1.0]]'
