@@ -119,6 +119,15 @@ def write_network(
             log.notes.append(
                 "not used: positions and readings beside the log; the scenario's count"
             )
+    _note_totals(log, account)
+    log.notes.insert(0, f"origin: simulated 0 is {log.origin} in the log")
+    log.notes.insert(1, f"resolution: stamps are multiples of {log.resolution:g} s")
+    files["report.txt"] = "\n".join([*log.notes, "", account.to_string(index=False), ""])
+    return files, tuple(log.notes)
+
+
+def _note_totals(log: PacketLog, account: pd.DataFrame) -> None:
+    """Note how many links and outcomes the ``account`` of a log has."""
     nodes = len({*account["sender"], *account["receiver"]})
     apart = nodes * (nodes - 1) - len(account)
     if apart:
@@ -136,10 +145,6 @@ def write_network(
             "replay: outcomes that are not known (unknown.csv) count as lost; "
             'network.channel.loss.after = "deliver" makes them heard'
         )
-    log.notes.insert(0, f"origin: simulated 0 is {log.origin} in the log")
-    log.notes.insert(1, f"resolution: stamps are multiples of {log.resolution:g} s")
-    files["report.txt"] = "\n".join([*log.notes, "", account.to_string(index=False), ""])
-    return files, tuple(log.notes)
 
 
 def rename_nodes(log: PacketLog) -> None:
