@@ -17,15 +17,10 @@ def run_at_rest(n: int, L: int, messages: int) -> dict[str, Any]:
     """Return by name the fields of a ``SlotRun``, or what stands for one, of n states and L lanes
     with room for so many ``messages``; links, readings, model and size are for the caller.
     """
-    arrived, sends = aligned((messages, L), np.uint8), aligned((L,), np.uint8)
-    arrived[:] = sends[:] = 1
+    sends = aligned((L,), np.uint8)
+    sends[:] = 1
     return {
-        "message": np.zeros(messages, dtype=np.int64),
-        "link": np.zeros(messages, dtype=np.int64),
-        "message_weight": np.zeros(messages),
-        "age": np.zeros(messages),
-        "heard": np.full(messages, -1),
-        "arrived": arrived,
+        **empty_inbox(L, messages),
         "sends": sends,
         "uniform": aligned((L,)),
         "common": ALIKE,
@@ -37,4 +32,18 @@ def run_at_rest(n: int, L: int, messages: int) -> dict[str, Any]:
         **dict.fromkeys(("reading", "first_y", "first_H", "count"), 0),
         **dict.fromkeys(("gap", "now"), 0.0),
         **scratch_of(n, L),
+    }
+
+
+def empty_inbox(L: int, messages: int) -> dict[str, Any]:
+    """Return by name the inbox of a run with L lanes, with room for so many ``messages``."""
+    arrived = aligned((messages, L), np.uint8)
+    arrived[:] = 1
+    return {
+        "message": np.zeros(messages, dtype=np.int64),
+        "link": np.zeros(messages, dtype=np.int64),
+        "message_weight": np.zeros(messages),
+        "age": np.zeros(messages),
+        "heard": np.full(messages, -1),
+        "arrived": arrived,
     }

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.kernels.at_rest import run_at_rest
+from netkf.algorithms.kernels.at_rest import empty_inbox, run_at_rest
 from netkf.algorithms.kernels.gates import GateTables, gate_tables, no_gate
 from netkf.algorithms.kernels.nonlinear_rows import linear_rows
 from netkf.algorithms.kernels.pairs import no_pairs, pairs_of
@@ -190,12 +190,7 @@ class ClockFilters:
             "H": np.zeros((readings, self._p, columns, 1)),
             "rows": np.zeros(readings, dtype=np.int64),
             "matrix": np.arange(readings),
-            "message": np.zeros(messages, dtype=np.int64),
-            "link": np.zeros(messages, dtype=np.int64),
-            "message_weight": np.zeros(messages),
-            "age": np.zeros(messages),
-            "heard": np.full(messages, -1),
-            "arrived": np.ones((messages, 1), dtype=np.uint8),
+            **empty_inbox(1, messages),
         }
 
     def _gate_of_instants(self) -> GateTables:
