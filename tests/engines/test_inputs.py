@@ -20,6 +20,7 @@ from netkf.runs.labels import mismatch_note
 from netkf.scenario.reading import from_table
 from netkf.scenario.usage import record_usage
 from netkf.theory.errors import error_law
+from tests.conftest import with_slow
 from tests.engines.agreement import assert_agree
 from tests.reference import kalman_update, kcf
 from tests.scenario.test_preconditions import ALL
@@ -93,7 +94,7 @@ COMPILED = {("kcf", "slots"), ("push-sum", "slots"), ("hybrid", "clocks"), ("gos
 
 
 @pytest.mark.one_in(5)
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", with_slow(ALL, {"block-intersection"}))
 def test_a_known_input_changes_no_event_no_covariance_and_no_error(name):
     found = {time: fitting(name, time) for time in ACTIVATIONS}
     cases = {time: driven for time, driven in found.items() if driven is not None}

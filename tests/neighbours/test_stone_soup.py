@@ -106,7 +106,10 @@ def test_nonlinear_detections_have_the_jacobian_of_their_sensor():
 
 
 def test_blocks_are_paths_of_their_own():
-    scenario = netkf.load(SCENARIOS / "blocks" / "cooperative_localisation.toml", {"horizon": 2.0})
+    scenario = netkf.load(
+        SCENARIOS / "blocks" / "cooperative_localisation.toml",
+        {"horizon": 2.0, "filter": {"kind": "local", "estimates": "own+neighbours"}},
+    )
     run = netkf.simulate(scenario)
     found = run.to_stonesoup()
     assert {truth.id for truth in found.truths} == {p.label for p in scenario.layout.places}

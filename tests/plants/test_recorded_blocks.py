@@ -319,7 +319,7 @@ def test_ranges_with_noise_of_their_own_and_an_origin_are_those_of_a_plain_ekf(t
     table |= {"sensors": [sensor], "time": {"origin": "2026-03-01T12:00:00Z"}}
     run = netkf.simulate(from_table(table, tmp_path), engine=engine)
     rows = {1: {2: [(7, 4.0, 0.04), (8, 3.0, 0.09)], 4: [(8, 2.5, 0.04)]}, 2: {3: [(8, 2.0, 0.01)]}}
-    own = table | {"filter": {"kind": "block-intersection", "estimates": "own"}}
+    own = table | {"filter": {"kind": "local", "estimates": "own"}}
     alone = netkf.simulate(from_table(own, tmp_path), engine="simpy")
     for node, first in ((1, 0), (2, 3)):
         x, P = _ekf(START[node], rows[node])
