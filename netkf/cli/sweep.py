@@ -58,5 +58,6 @@ def _print_sweep(
     print(f"\n{format_sweep(completed.table, completed.keys)}\n")
     points = len(completed.table)
     line = f"{points:,} point{'s' if points > 1 else ''} of {runs:,} run{'s' if runs > 1 else ''}"
-    line += f" in {completed.seconds:.2f} s, all with the same random draws"
+    line += f" in {completed.seconds:.2f} s"
+    line += "" if "seed" in completed.keys else ", all with the same random draws"
     print(line + ("; +- one standard error" if runs > 1 else ""))

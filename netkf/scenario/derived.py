@@ -97,9 +97,9 @@ class DerivedScenario(ScenarioModel):
         """The scenario with the plant after all its changes, and what filters believe then."""
         return self.piece(len(self.plant.changes)) if len(self.plant.changes) else self
 
-    def piece(self, number: int, cov: tuple[FloatArray, ...] | None = None) -> Self:
+    def piece(self, number: int, cov: tuple[FloatArray, ...] | FloatArray | None = None) -> Self:
         """Return this scenario with a plant that is always as in one piece, and what filters
-        believe then; they start with ``cov``, (n, n) of each node.
+        believe then; they start with ``cov``, (n, n) of each node or of all.
         """
         names = "FQ" if self.slotted else "AB"
         plants: Any = self.plant.pieces

@@ -15,6 +15,8 @@ from netkf.studies.targets import Target, quantity_by_theory
 
 STEP = 1.1
 """Factor by which keys are changed to see which helps."""
+LESS = 1.0 - 1e-6
+"""Ratio of the quantity to before from which a key does not help."""
 BEYOND = "no exchange of messages reaches the limit, better readings may"
 """End of the sentence where the centralised filter, whose errors are the smallest, misses it."""
 
@@ -36,7 +38,7 @@ def describe_help(scenario: Scenario, target: Target, searched: str) -> str:
     if has_roots and value > target.limit:
         return f"{sentence}: {BEYOND}"
     changes = sorted(_changes(scenario, target, searched))
-    if not changes or changes[0][0] >= 1.0:
+    if not changes or changes[0][0] >= LESS:
         return sentence
     listed = [
         f"{key} = {text} ({100.0 * (ratio - 1.0):+.2g} %)" for ratio, key, text in changes[:2]

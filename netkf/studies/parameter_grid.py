@@ -6,6 +6,8 @@ import itertools
 import math
 import re
 from collections.abc import Mapping, Sequence
+from datetime import date
+from datetime import time as clock_time
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +19,8 @@ from netkf.scenario.values import parse_values, split_setting
 from netkf.scenario.writing import part_as_table, resolve_defaults, toml_text
 
 MAX_POINTS = 10_000  # more are a slip
+MAX_INTEGER = 2**63
+"""Integers from it on fit no column of a table."""
 _RANGE = re.compile(r"^([^:,\[{\"']+):([^:,]+):(\d+)$")
 
 
@@ -42,7 +46,9 @@ def _even_values(key: str, start: str, stop: str, count: str) -> list[Any]:
     except ValueError:
         integers = []  # wrong texts are refused below
     if not _are_finite(start, stop) or not 2 <= int(count) <= MAX_POINTS:
-        rule = f"range of {key} must be START:STOP:COUNT with two numbers and a count of at least 2"
+        rule = (
+            f"range of {key} must be START:STOP:COUNT, two numbers and 2 to {MAX_POINTS:,} values"
+        )
         raise ScenarioError("--vary", rule, f"{start}:{stop}:{count}", "correct it")
     values = np.linspace(low, high, number)
     if integers and np.array_equal(values, np.round(values)):
@@ -67,10 +73,8 @@ def check_grid(grid: Any) -> dict[str, list[Any]]:
         if not listed:
             raise ScenarioError("--vary", f"{key} needs a list of values", values, "give some")
         plain = values.tolist() if isinstance(values, np.ndarray) else list(values)
-        # Parts stand for their tables, which manifests and tables of results can hold.
-        values_by_key[str(key)] = [
-            part_as_table(v) if isinstance(v, Component) else v for v in plain
-        ]
+        values_by_key[str(key)] = list(map(_storable, plain))
+    _require_apart(list(values_by_key))
     size = math.prod(map(len, values_by_key.values()))
     if size > MAX_POINTS:
         rule = f"is a grid of {size:,} points, at most {MAX_POINTS:,} are possible"
@@ -78,32 +82,62 @@ def check_grid(grid: Any) -> dict[str, list[Any]]:
     return values_by_key
 
 
+def _storable(value: Any) -> Any:
+    """Return a value as manifests and tables of results can hold it, parts as their tables."""
+    if isinstance(value, Component):
+        return part_as_table(value)
+    return value.isoformat() if isinstance(value, (date, clock_time)) else value
+
+
+def _require_apart(keys: list[str]) -> None:
+    """Raise ScenarioError if a key sets again what an earlier one has varied."""
+    paths = [key.replace("[", ".").replace("]", "").split(".") for key in keys]
+    for (first, path), (key, later) in itertools.combinations(zip(keys, paths, strict=True), 2):
+        if path[: len(later)] == later:
+            rule = f"{key} replaces the values of {first}, which is varied before it"
+            remedy = "vary the table first" if path != later else "give all values in one list"
+            raise ScenarioError("--vary", rule, None, remedy)
+
+
 class GridPoint(NamedTuple):
-    """A point of a grid: the changes of keys, and the scenario with these changes."""
+    """A point of a grid: the changes of keys, the scenario with them, and the changes as entries
+    of a table's columns.
+    """
 
     changes: dict[str, Any]
     scenario: Scenario
+    row: dict[str, Any]
 
 
 def expand_grid(scenario: Scenario, grid: Mapping[str, Sequence[Any]]) -> list[GridPoint]:
     """Return all points of a grid, the last key fastest; raises ScenarioError."""
     values = check_grid(grid)
-    points = [
-        dict(zip(values, chosen, strict=True)) for chosen in itertools.product(*values.values())
-    ]
+    points, rows = (
+        [dict(zip(values, chosen, strict=True)) for chosen in itertools.product(*columns)]
+        for columns in (values.values(), map(table_column, values.values()))
+    )
     grid_points = []
-    for changes in points:
+    for changes, row in zip(points, rows, strict=True):
         try:
-            grid_points.append(GridPoint(changes, scenario.replace(changes)))
+            grid_points.append(GridPoint(changes, scenario.replace(changes), row))
         except ScenarioError as error:
             point = ", ".join(f"{key} = {toml_text(value)}" for key, value in changes.items())
             raise error.in_file(f"at {point}") from None
     return grid_points
 
 
-def table_value(value: Any) -> Any:
-    """Return a value for a table: numbers and texts unchanged, others as TOML."""
-    return toml_text(value) if isinstance(value, (dict, list, tuple)) else value
+def table_column(values: Sequence[Any]) -> list[Any]:
+    """Return values for one column of a table: numbers, flags or texts unchanged, others as TOML,
+    and so all if they are of several types.
+    """
+    are_flags = [isinstance(value, bool) for value in values]
+    are_numbers = [
+        isinstance(value, float) or (isinstance(value, int) and abs(value) < MAX_INTEGER)
+        for value in values
+    ]
+    if all(are_flags) or (all(are_numbers) and not any(are_flags)):
+        return list(values)
+    return [value if isinstance(value, str) else toml_text(value) for value in values]
 
 
 def parse_interval(setting: str) -> tuple[str, float | int, float | int]:

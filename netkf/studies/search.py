@@ -172,7 +172,9 @@ class Search:
             misses = good.value
             # One more value shows whether the quantity is monotone at all.
             middle = self._value_between(low, high)
-            self._probe(low if middle is None else middle)
+            between = self._probe(low if middle is None else middle)
+            if between.target == REACHED:
+                value, misses = self._bisect(between.value, bad.value)
         central = self._describe_central(misses if value is None else value)
         hopeless = value is None and central.endswith(BEYOND) and not self.key.startswith("sensors")
         return Sizing(
@@ -203,7 +205,11 @@ class Search:
             value, misses = (middle, misses) if reached else (value, middle)
             # Close to an undecided value simulation noise hides the limit.
             undecided = any(p.value == misses and p.target == UNDECIDED for p in self.probes)
-            if undecided and max(value, misses) <= END_RATIO * min(value, misses):
+            if (
+                undecided
+                and value * misses > 0.0
+                and (max(abs(value), abs(misses)) <= END_RATIO * min(abs(value), abs(misses)))
+            ):
                 break
         return value, misses
 
@@ -286,7 +292,8 @@ class Search:
         by_value = sorted(self.probes)
         if value is not None and misses is None:
             end = by_value[-1] if grows else by_value[0]
-            return self._advise_range(end.value, end.value * (10.0 if grows else 0.1))
+            is_further = grows == (end.value > 0.0)
+            return self._advise_range(end.value, end.value * (10.0 if is_further else 0.1))
         nearest = next(probe for probe in by_value if probe.value == misses)
         runs = self._advise_runs(nearest)
         if value is not None:

@@ -41,7 +41,7 @@ from netkf.studies.metrics import (
     square_root_of,
     worst_node,
 )
-from netkf.studies.parameter_grid import GridPoint, check_grid, expand_grid, table_value
+from netkf.studies.parameter_grid import GridPoint, check_grid, expand_grid
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -152,8 +152,7 @@ def _make_row(point: GridPoint, metrics: RunMetrics) -> Row:
     }
     columns = zip(ensemble_names(point.scenario), metrics.quantities.T, strict=True)
     quantities |= {name: mean_over_runs(values) for name, values in columns}
-    row: Row = {key: table_value(value) for key, value in point.changes.items()}
-    row["runs"] = len(metrics.trace)
+    row: Row = {**point.row, "runs": len(metrics.trace)}
     for name, (value, error) in quantities.items():
         row |= {name: value, f"{name}_se": error}
     row["bound"] = _value_or_nan(lambda: float(bound_traces(point.scenario).mean()))

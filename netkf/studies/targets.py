@@ -111,8 +111,10 @@ def parse_target(text: Any) -> Target:
     """Return the target of a text like ``worst_rms<=0.5``; raises ScenarioError."""
     pattern = r"\s*([\w.]+)\s*(<=|>=)\s*(\S+)\s*"
     match = re.fullmatch(pattern, text) if isinstance(text, str) else None
-    listed = ", ".join((*QUANTITIES, "quantile_99 and others"))
-    if match is None or not (match[1] in QUANTITIES or QUANTILE.fullmatch(match[1])):
+    listed = ", ".join((*QUANTITIES, "quantile_99 and others up to quantile_100"))
+    quantile = match and QUANTILE.fullmatch(match[1])
+    is_known = match and (match[1] in QUANTITIES or (quantile and float(quantile[1]) <= 100.0))
+    if match is None or not is_known:
         message = f"must be QUANTITY<=LIMIT with a quantity of {listed}"
         raise ScenarioError("--target", message, text, "write worst_rms<=0.5")
     least = match[2] == ">="

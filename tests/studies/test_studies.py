@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -92,6 +93,21 @@ def test_grids_are_lists_ranges_tables_and_words():
         (["sweep", RING, "--vary", f"{RATE}=1,2", "--vary", f"{RATE}=3"], "is varied twice"),
         (["sweep", RING, "--vary", f"{RATE}=1,-2"], f"at {RATE} = -2: {RATE}: must be a finite"),
         (["sweep", RING, "--vary", "network.activation.rat=1"], "is not a key here"),
+        (
+            [
+                "sweep",
+                RING,
+                "--vary",
+                f"{RATE}=1,2",
+                "--vary",
+                'network.activation={kind="poisson"}',
+            ],
+            f"network.activation replaces the values of {RATE}",
+        ),
+        (
+            ["sweep", RING, "--vary", "sensors.0.R=1", "--vary", "sensors[0].R=2"],
+            "give all values in one list",
+        ),
         (["sweep", RING, "--vary", f"{RATE}=1:5:1"], "must be START:STOP:COUNT"),
         (["sweep", RING, "--vary", f"{RATE}=a:b:3"], "must be START:STOP:COUNT"),
         (["sweep", RING, "--vary", f"{RATE}=1:2:9999", "--vary", "horizon=1:2:9"], "is a grid of"),
@@ -109,6 +125,7 @@ def test_grids_are_lists_ranges_tables_and_words():
         ),
         (["size", RING, "--vary", f"{RATE}=1:2", "--target", "rms<=1"], "--target: must be QUANT"),
         (["size", RING, "--vary", f"{RATE}=1:2", "--target", "mean_rms<=-1"], "above 0"),
+        (["size", RING, "--vary", f"{RATE}=1:2", "--target", "quantile_101<=1"], "--target: must"),
         (["size", RING, "--vary", f"{RATE}=1:2", "--target", "mean_rms>=1"], "--target: must be"),
         (
             [
@@ -249,6 +266,32 @@ def test_sweeps_meet_one_truth_or_say_another(key, values, moved):
     for k, run in enumerate(runs):
         _, here, there = np.intersect1d(runs[0].times, run.times, return_indices=True)
         assert np.array_equal(runs[0].x[here], run.x[there]) != (k in moved)
+
+
+def test_values_of_several_types_share_a_column(tmp_path):
+    """Numbers beside lists, numbers of many digits and TOML's times can be stored."""
+    scenario = from_table(SAMPLED, Path())
+    grid = {"probe": [1.0, [2.0, 3.0]], "seed": [1, 10**25]}
+    grid |= {"time.origin": [datetime(2020, 1, 1), 5.0]}
+    plan = plan_sweep(scenario, grid, engine="simpy")
+    table = sweep_to_directory(plan, tmp_path / "out", PoolOptions(1)).table
+    stored = pd.read_parquet(tmp_path / "out" / "sweep.parquet")
+    assert list(stored["probe"]) == list(table["probe"]) == ["1.0"] * 4 + ["[2.0, 3.0]"] * 4
+    assert list(stored["seed"][:3]) == ["1", "1", f"1{'0' * 25}"]
+    assert list(stored["time.origin"][:2]) == ["2020-01-01T00:00:00", "5.0"]
+
+
+def test_the_centralised_filter_follows_changes_of_the_plant():
+    """Its trace beside that of the scalar Riccati equation, whose A changes at 1 s."""
+    changed = {"plant.schedule": [{"from": 1.0, "A": [[0.5]]}], "sensors.0.sampling": "continuous"}
+    scenario = from_table(SAMPLED, Path()).replace(changed)
+
+    def slope(t, P):
+        return (-0.4 if t <= 1.0 else 1.0) * P + 1.0 - 10.0 * P**2
+
+    before = scipy.integrate.solve_ivp(slope, (0.0, 1.0), [1.0], rtol=1e-9).y[0, -1]
+    after = scipy.integrate.solve_ivp(slope, (1.0, 4.0), [before], rtol=1e-9, t_eval=[2, 3, 4])
+    assert central_trace(scenario) == pytest.approx(np.mean([before, *after.y[0]]), rel=1e-5)
 
 
 def test_json_of_a_sweep_is_one_document(tmp_path, capsys, monkeypatch):
@@ -477,6 +520,26 @@ def test_all_of_the_range_and_none_of_it(short):
     none = size(short, RATE, 1.0, 2.0, "mean_trace<=0.1")
     assert not none
     assert len(none.table) == 3
+
+
+def test_a_target_that_only_the_middle_reaches(build):
+    """The offset of a Kalman filter's first estimate, which is wrong on both sides of the truth."""
+    scenario = build(**SCALAR, filter={"kind": "local", "mean": [0.0]}).replace({"horizon": 3.0})
+    P, shrunk, squares = 2.0, 1.0, []
+    for _ in range(3):
+        P = 1.1**2 * P + 1.0
+        gain = P / (P + 0.5)
+        P, shrunk = (1.0 - gain) * P, 1.1 * (1.0 - gain) * shrunk
+        squares.append([P, shrunk**2])
+    P, shrunk = np.mean(squares, axis=0)
+    target = f"worst_rms<={np.sqrt(P + shrunk):.12g}"  # so that offsets up to 1 reach it
+    found = size(scenario, "filter.mean.0", -10.0, 9.0, target, engine="simpy", workers=1)
+    assert 0.9 <= abs(found.value) <= 1.0
+    assert 1.0 <= abs(found.misses) <= 1.1
+    assert "NOT monotone" in found.sure
+    assert "reaches" in format_answer(found)
+    every = size(scenario, "sensors.0.H.0.0", -2.0, -1.0, "mean_trace<=9", by="theory")
+    assert every.advice == "next range: --vary sensors.0.H.0.0=-1:-0.1"
 
 
 def test_theory_that_does_not_tell_is_refused_or_replaced(short):

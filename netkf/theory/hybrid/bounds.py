@@ -78,7 +78,7 @@ def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
 
 def _bound_over_pieces(scenario: Scenario, times: FloatArray) -> FloatArray:
     edges, bounds = [0.0, *scenario.plant.changes.tolist(), math.inf], []
-    cov: tuple[FloatArray, ...] | None = None
+    cov: tuple[FloatArray, ...] | FloatArray | None = None
     for k, (start, end) in enumerate(itertools.pairwise(edges)):
         piece = scenario.piece(k, cov)
         equations = coupled_riccati(piece)
@@ -99,9 +99,7 @@ def _bound_over_pieces(scenario: Scenario, times: FloatArray) -> FloatArray:
             break
         bound = covariance_bound(piece, moments)
         bounds.append(bound[: len(inside)])
-        cov = tuple(bound[-1])
-        if piece.node_filter.timing.pooled:
-            cov = cov[:1]
+        cov = bound[-1, 0] if piece.node_filter.timing.pooled else tuple(bound[-1])
     return np.concatenate(bounds)
 
 
