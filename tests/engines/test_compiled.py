@@ -195,7 +195,7 @@ def scenarios(draw):
     }
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck))
 @given(scenarios())
 def test_drawn_scenarios_agree(tables):
     if tables["filter"]["kind"] in {"local", "central"}:
@@ -304,7 +304,7 @@ def test_drawn_scenarios_of_the_literature_agree(tables):
     assert_agree(scenario)
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
 @given(slotted())
 def test_drawn_scenarios_in_slots_agree(tables):
     try:

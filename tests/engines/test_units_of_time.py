@@ -139,7 +139,7 @@ def clocked_cases(draw):
 
 
 @given(clocked_cases(), st.sampled_from(list(UNITS)))
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_clocks_in_every_unit(case, name):
     unit = UNITS[name]
     run, other = (netkf.simulate(clocked(u, *case), engine="simpy") for u in (1.0, unit))
