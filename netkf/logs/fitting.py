@@ -64,6 +64,8 @@ MAKERS = {
 """Laws that do without an assumption."""
 MAYBE = 0.05
 """Below this p a departure is allowed for in other tests, whether it is there or not."""
+SAME_DELAY = 1e-9
+"""Standard deviation of the logarithms of delays below which all are the same."""
 KEY = ["sender", "receiver", "message"]
 UNKNOWN, REPLAY = "unknown.csv", "fit_replay.csv"
 FILES = ("fit_links.csv", "fit_tests.csv", "fit_laws.csv", FIT_FILE)
@@ -172,7 +174,7 @@ def fit_log(
             f"shared fate of hearers: {share.value:.3f} +- {share.error:.3f}; {share.lasting:.3f} "
             "of it lasts to the next transmission (slow changes, or shared bursts)"
         )
-    envelope, delay = pd.DataFrame(), _delay_table(scenario, notes)
+    envelope, delay = pd.DataFrame(), _delay_table(scenario, table, notes)
     if runs is None or runs > 0:
         replay = _complete_replay(folder, scenario, table, links, notes)
         pool = PoolOptions(workers=workers)
@@ -474,7 +476,7 @@ def _law_table(laws: list[Law], rejected: set[str], count: int) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=columns)
 
 
-def _delay_table(scenario: Scenario, notes: list[str]) -> dict[str, Any]:
+def _delay_table(scenario: Scenario, table: pd.DataFrame, notes: list[str]) -> dict[str, Any]:
     """Return a delay law in place of a recorded one: that of a lost message is in no record."""
     delay = scenario.network.channel.delay
     if not isinstance(delay, RecordedDelay):
@@ -485,9 +487,18 @@ def _delay_table(scenario: Scenario, notes: list[str]) -> dict[str, Any]:
     seconds = np.array([v for v in listed if v > 0.0])
     if not len(seconds):
         return {"kind": "none"}
-    sigma = float(np.log(seconds).std())
-    notes.append(f"delays: fitted as lognormal with mean {seconds.mean():.3g} s, sigma {sigma:.3g}")
-    return {"kind": "lognormal", "mean": float(seconds.mean()), "sigma": sigma}
+    heard = table[table["delivered"] == 1].get("delay", pd.Series(dtype=float))
+    if at_once := int((pd.to_numeric(heard, errors="coerce") == 0.0).sum()):
+        notes.append(
+            f"{at_once:,} of {at_once + len(seconds):,} delays are 0, below the resolution of the "
+            "stamps: the law of delays is that of the others"
+        )
+    mean, sigma = float(seconds.mean()), float(np.log(seconds).std())
+    if sigma < SAME_DELAY:
+        notes.append(f"delays: all are {mean:.3g} s")
+        return {"kind": "constant", "seconds": mean}
+    notes.append(f"delays: fitted as lognormal with mean {mean:.3g} s, sigma {sigma:.3g}")
+    return {"kind": "lognormal", "mean": mean, "sigma": sigma}
 
 
 def _write(

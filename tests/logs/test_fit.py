@@ -304,3 +304,17 @@ def test_only_a_record_can_be_fitted(tmp_path):
     (tmp_path / "scenario.toml").write_text((SCENARIOS / "poisson_ring.toml").read_text())
     with pytest.raises(ScenarioError, match=r"network.channel.loss.kind: must be recorded"):
         netkf.fit_log(tmp_path)
+
+
+@pytest.mark.parametrize("shares", [(1.0, 0.0), (0.6, 0.4)])
+def test_delays_of_one_length_are_constant_and_those_of_none_are_counted(tmp_path, shares):
+    rows = ["t,sender,receiver,number,heard,t_heard"]
+    for k in range(10):
+        late = 0.3 if k < 10 * shares[0] else 0.0
+        rows.append(f"{0.1 * k:.1f},a,b,{k},1,{0.1 * k + late:.1f}")
+    (tmp_path / "log.csv").write_text("\n".join(rows))
+    netkf.import_log(tmp_path / "log.csv", "csv", tmp_path / "made")
+    found = netkf.fit_log(tmp_path / "made", runs=0)
+    delay = netkf.load(found.scenarios["bernoulli"]).network.channel.delay
+    assert delay.seconds == pytest.approx(0.3, abs=1e-12)
+    assert any("4 of 10 delays are 0" in note for note in found.notes) == (shares[1] > 0.0)
