@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from netkf.core.errors import ScenarioError, suggest_nearest
+from netkf.core.errors import ScenarioError, TheoryError, suggest_nearest
 from netkf.figures.consistency import nees_figure, nis_figure, whiteness_figure
 from netkf.figures.envelope import envelope_figure
 from netkf.figures.error import error_figure, quantiles_figure, ratios_figure
@@ -108,8 +108,10 @@ class FigureSet:
                     if reason is not None:
                         raise UnavailableError(reason)
                 return FIGURES[name](self._data)
-            except UnavailableError as unavailable:
-                reason = str(unavailable)
+            except (UnavailableError, TheoryError) as error:
+                reason = str(error)
+                if isinstance(error, TheoryError):  # one figure without an answer stops no other
+                    reason = f"Theory has no answer: {reason}."
                 headline = f"No {name.upper() if name in ACRONYMS else name} to show"
                 if self._envelope is not None:
                     return message_figure(headline, reason, [])

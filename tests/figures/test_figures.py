@@ -9,7 +9,7 @@ import pytest
 import netkf
 from netkf.cli.main import main
 from netkf.figures import plane
-from netkf.figures.catalogue import FIGURES, FigureSet
+from netkf.figures.catalogue import FIGURES, FigureSet, plot_to_files
 from netkf.figures.names import FIGURE_NAMES
 from netkf.figures.style import style_context
 from tests.conftest import SCENARIOS, with_slow
@@ -98,6 +98,22 @@ def test_what_a_run_lacks_stands_in_its_figure(drawing, kind):
     name, words = SAYS[kind]
     figure = drawing(kind).draw(name)
     assert words in " ".join(" ".join(text for text, _ in shown_texts(figure)).split())
+
+
+def test_a_theorem_without_an_answer_leaves_the_other_figures(tmp_path, monkeypatch):
+    """Samples at known times: the bound goes round a cycle and has no steady state."""
+    monkeypatch.setattr(
+        netkf.figures.catalogue, "FIGURES", {name: FIGURES[name] for name in ("stability", "error")}
+    )
+    every = {"kind": "periodic", "period": 1.0}
+    loss = {"loss": {"kind": "bernoulli", "delivery": 0.5}}
+    scenario = netkf.load(SCENARIOS / "poisson_ring.toml")
+    changes = {"horizon": 2.0, "sensors.0.sampling": every, "network.channel": loss}
+    run = netkf.simulate(scenario.replace(changes), engine="simpy")
+    paths = plot_to_files(run, (), tmp_path / "out", "svg")
+    assert [path.stem for path in paths] == ["stability", "error"]
+    text = " ".join(text for text, _ in shown_texts(netkf.plot(run, "stability")))
+    assert "Theory has no answer: samples at known times" in " ".join(text.split())
 
 
 def test_titles_say_what_the_data_says(results, drawing):
