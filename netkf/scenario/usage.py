@@ -27,8 +27,8 @@ from netkf.scenario.records import (
 )
 
 Use = dict[str, Any]
-"""The use of one table: ``path``, ``rows``, ``unused``, where rows repeat others ``used`` and
-``merged``, and for losses and delays ``beyond`` and ``after``; see ``record_usage``.
+"""The use of one table: ``path``, ``rows``, ``used``, ``merged``, ``unused``, and for losses and
+delays ``beyond`` and ``after``; see ``record_usage``.
 """
 OUTCOMES = {
     "deliver": "were delivered",
@@ -44,9 +44,8 @@ def record_usage(scenario: DerivedScenario, sent: Mapping[Link, int] | None) -> 
     """Return the use of each table by a run to the horizon, by the first key that names it.
 
     ``sent`` counts the messages of each directed link, lost ones included; None leaves out the
-    tables of losses and delays. Each entry has ``path``, ``rows`` and ``unused``; where rows repeat
-    others also ``used`` and ``merged`` (``rows`` is the sum of the three). Those of losses and
-    delays have ``beyond``, messages that are not listed, and ``after``, what becomes of these.
+    tables of losses and delays. Each entry has ``path`` and ``rows``, the sum of ``used``,
+    ``merged`` (with rows that they repeat) and ``unused``. Those of losses and delays have ``beyond``, messages that are not listed, and ``after``, what becomes of these.
     Tables of graphs and positions have entries only if rows repeat others or are unused.
     """
     uses = {
@@ -140,10 +139,10 @@ def repeat_notes(scenario: DerivedScenario) -> tuple[str, ...]:
 
 
 def _make_use(use: RowUse) -> Use:
-    counts: Use = {"path": use.path, "rows": use.rows}
-    if use.merged:
-        counts |= {"used": use.used, "merged": use.merged}
-    return counts | {"unused": use.unused}
+    counts: Use = {
+        name: getattr(use, name) for name in ("path", "rows", "used", "merged", "unused")
+    }
+    return counts
 
 
 def _find_activation_use(scenario: DerivedScenario) -> RowUse | None:

@@ -169,10 +169,14 @@ def bound_traces(scenario: Scenario) -> FloatArray:
 
 def central_trace(scenario: Scenario) -> float:
     """Return the trace of P of a filter with all readings and the true model, averaged over time
-    and over what nodes estimate. Raises TheoryError if readings are recorded or H is random.
+    and over what nodes estimate. Raises TheoryError if readings are recorded, H is random or nodes are
+    down at times.
     """
-    algorithm = Central()
-    central = dataclasses.replace(scenario, filter=Filtering(algorithm=algorithm))
+    if scenario.network.lives:
+        raise TheoryError("nodes that are down read nothing: what all readings give is random")
+    network = dataclasses.replace(scenario.network, clocks=())
+    filtering = Filtering(algorithm=Central())
+    central = dataclasses.replace(scenario, filter=filtering, network=network)
     if scenario.slotted:
         _require_fixed_H(scenario)
         P = _slot_covariances(scenario, 0, scenario.plant.start_cov, central.model_pieces)

@@ -371,7 +371,7 @@ def test_names_units_and_origin(tmp_path):
     assert sent.min() == 10.0
     assert [str(node) for node in named.nodes] == ["b", "a"]
     use = record_usage(named, None)["network.positions"]
-    assert use == {"path": "places.csv", "rows": 4, "unused": 1}
+    assert use == {"path": "places.csv", "rows": 4, "used": 3, "merged": 0, "unused": 1}
     again = from_table(parse_toml(to_toml(as_table(named))), tmp_path)
     assert netkf.simulate(again).fingerprint == run.fingerprint
 

@@ -43,11 +43,13 @@ TABLES = {
     "late": "sender,receiver,message,seconds\n1,0,0,0.25\n1,0,2,0.5\n2,1,0,1\n",
 }
 USED = {
-    "network.activation": {"path": "ticks.csv", "rows": 6, "unused": 1},
+    "network.activation": {"path": "ticks.csv", "rows": 6, "used": 5, "merged": 0, "unused": 1},
     # Sent: 1 to 0 three, 1 to 2 three, 0 to 1 two. Listed of these: 2, 1 and 1.
     "network.channel.loss": {
         "path": "lost.csv",
         "rows": 5,
+        "used": 4,
+        "merged": 0,
         "unused": 1,
         "beyond": 4,
         "after": "lose",
@@ -55,12 +57,14 @@ USED = {
     "network.channel.delay": {
         "path": "late.csv",
         "rows": 3,
+        "used": 2,
+        "merged": 0,
         "unused": 1,
         "beyond": 6,
         "after": "deliver",
     },
-    "sensors[0]": {"path": "readings.csv", "rows": 4, "unused": 2},
-    "sensors[1].sampling": {"path": "samples.csv", "rows": 3, "unused": 1},
+    "sensors[0]": {"path": "readings.csv", "rows": 4, "used": 2, "merged": 0, "unused": 2},
+    "sensors[1].sampling": {"path": "samples.csv", "rows": 3, "used": 2, "merged": 0, "unused": 1},
 }
 NOTES = [
     "note: network.activation: 1 of 6 rows were not used (ticks.csv)",

@@ -257,10 +257,12 @@ def test_what_a_run_used_of_its_records(build, tmp_path):
     )
     usage = record_usage(scenario, {(0, 1): 3, (1, 0): 1})
     assert usage == {
-        "network.activation": {"path": "ticks.csv", "rows": 3, "unused": 1},
+        "network.activation": {"path": "ticks.csv", "rows": 3, "used": 2, "merged": 0, "unused": 1},
         "network.channel.loss": {
             "path": "lost.csv",
             "rows": 2,
+            "used": 1,
+            "merged": 0,
             "unused": 1,
             "beyond": 3,
             "after": "lose",
@@ -268,11 +270,19 @@ def test_what_a_run_used_of_its_records(build, tmp_path):
         "network.channel.delay": {
             "path": "late.csv",
             "rows": 1,
+            "used": 1,
+            "merged": 0,
             "unused": 0,
             "beyond": 3,
             "after": "deliver",
         },
-        "sensors[0].sampling": {"path": "samples.csv", "rows": 3, "unused": 2},
+        "sensors[0].sampling": {
+            "path": "samples.csv",
+            "rows": 3,
+            "used": 1,
+            "merged": 0,
+            "unused": 2,
+        },
     }
     assert usage_notes(usage) == (
         "network.activation: 1 of 3 rows were not used (ticks.csv)",
