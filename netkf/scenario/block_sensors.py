@@ -90,7 +90,12 @@ def estimated_blocks(
                     f"{suggest_nearest(estimates, (*CHOICES, *layout.names))}names are {listed}"
                 )
                 raise ScenarioError("", rule, estimates, remedy)
-            own = tuple(layout.require(name, node) for name in dict.fromkeys(names))
+            # Of the blocks of these names those that the node has.
+            own = tuple(
+                layout.require(name, node)
+                for name in dict.fromkeys(names)
+                if name not in layout.names or layout.find(name, node) is not None
+            )
         if not own:
             rule = f"must give every node a block, and node {node} has none"
             raise ScenarioError("", rule, estimates, "give it one in [[plants]], or choose others")

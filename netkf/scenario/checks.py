@@ -242,7 +242,7 @@ def _check_owners(scenario: DerivedScenario, name: str, entries: Sequence[Any]) 
                 )
                 remedy = 'write sampling = { kind = "periodic", period = ... } in its [[sensors]]'
                 raise ScenarioError(key, rule, node, remedy)
-    if owners and scenario.node_filter.timing.pooled:
+    if owners and name == "clocks" and scenario.node_filter.timing.pooled:
         rule = f"has no meaning for the {filter_name(scenario)}, which is in no node"
         raise ScenarioError(f"network.{name}", rule, sorted(owners), "remove it")
 

@@ -475,6 +475,8 @@ class ScenarioModel(Component):
     @cached_property
     def forgetful_nodes(self) -> tuple[int, ...]:
         """The nodes (ids, in order) that forget what they know when they are down."""
+        if self.node_filter.timing.pooled:  # it is in no node
+            return ()
         lost = [life.nodes for life in self.network.lives if life.memory == "lost"]
         return tuple(sorted(node for nodes in lost for node in nodes))
 

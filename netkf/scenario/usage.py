@@ -45,7 +45,8 @@ def record_usage(scenario: DerivedScenario, sent: Mapping[Link, int] | None) -> 
 
     ``sent`` counts the messages of each directed link, lost ones included; None leaves out the
     tables of losses and delays. Each entry has ``path`` and ``rows``, the sum of ``used``,
-    ``merged`` (with rows that they repeat) and ``unused``. Those of losses and delays have ``beyond``, messages that are not listed, and ``after``, what becomes of these.
+    ``merged`` (with rows that they repeat) and ``unused``. Those of losses and delays have
+    ``beyond``, messages that are not listed, and ``after``, what becomes of these.
     Tables of graphs and positions have entries only if rows repeat others or are unused.
     """
     uses = {

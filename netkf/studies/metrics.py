@@ -22,6 +22,7 @@ from netkf.runs.simulate import simulate
 from netkf.scenario.model import Filtering
 from netkf.scenario.scenario import Scenario
 from netkf.theory import covariance_bound, riccati_step
+from netkf.theory.common.evidence import require_every_reading, require_linear
 from netkf.theory.errors import error_squares
 from netkf.trace.nees import traces
 from netkf.trace.schema import KINDS
@@ -154,6 +155,7 @@ def bound_traces(scenario: Scenario) -> FloatArray:
         return time_average(scenario, np.trace(bound, axis1=2, axis2=3))
     if scenario.filter.algorithm.timing.talks:
         raise TheoryError("Tanwani's H(12) is about filters in continuous time")
+    require_linear(scenario)
     _require_fixed_H(scenario)
     # A pooled filter has the readings of all nodes.
     pooled = scenario.filter.algorithm.timing.pooled
@@ -169,11 +171,9 @@ def bound_traces(scenario: Scenario) -> FloatArray:
 
 def central_trace(scenario: Scenario) -> float:
     """Return the trace of P of a filter with all readings and the true model, averaged over time
-    and over what nodes estimate. Raises TheoryError if readings are recorded, H is random or nodes are
-    down at times.
+    and over what nodes estimate. Raises TheoryError if readings are recorded or missing, or H is
+    random.
     """
-    if scenario.network.lives:
-        raise TheoryError("nodes that are down read nothing: what all readings give is random")
     network = dataclasses.replace(scenario.network, clocks=())
     filtering = Filtering(algorithm=Central())
     central = dataclasses.replace(scenario, filter=filtering, network=network)
@@ -188,8 +188,11 @@ def central_trace(scenario: Scenario) -> float:
 
 
 def _require_fixed_H(scenario: Scenario) -> None:
-    """Raise TheoryError if readings are recorded, H is random or the dynamics are not linear."""
+    """Raise TheoryError if readings are recorded or missing, H is random or the dynamics are not
+    linear.
+    """
     _ = scenario.linear_plant
+    require_every_reading(scenario)
     if not scenario.is_random:
         raise TheoryError("the readings are recorded: their law is unknown")
     for node in scenario.sensing_nodes:

@@ -33,6 +33,7 @@ from netkf.theory import (
 from netkf.theory.assumption_rows import assumption_rows
 from netkf.theory.block_promises import block_lines, block_promises
 from netkf.theory.common.blocks import have_one_view
+from netkf.theory.common.evidence import require_every_reading
 from netkf.theory.common.papers import paper_legend
 from netkf.theory.common.requirements import scenario_of_estimates
 from netkf.theory.folders import theory_of
@@ -133,6 +134,7 @@ def _steady_error(scenario: Scenario) -> dict[str, Any]:
 def _slot_central_covariance(scenario: Scenario) -> FloatArray:
     """Return P* (n, n) of all readings in every slot; raises TheoryError if H varies."""
     _ = scenario.linear_plant  # raises TheoryError if there is no F
+    require_every_reading(scenario)
     for node in scenario.sensing_nodes:
         scenario.observation_matrices(node)  # raises TheoryError if H is not constant
     model = scenario.pooled_slot_model

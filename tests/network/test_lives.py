@@ -1,5 +1,7 @@
 """Nodes that crash, sleep, join and leave."""
 
+import json
+
 import numpy as np
 import pytest
 import scipy.linalg
@@ -618,3 +620,51 @@ def write(scenario):
     path = scenario._folder / "again.toml"
     path.write_text(to_toml(as_table(scenario)))
     return path
+
+
+@pytest.mark.parametrize("memory", ["kept", "lost"])
+@pytest.mark.parametrize("text", [SLOTS, CLOCKS], ids=["slots", "clocks"])
+def test_the_central_filter_misses_what_nodes_that_are_down_do_not_read(scenario_of, text, memory):
+    scenario = scenario_of(text, *recorded(memory), filter_="central")
+    run = netkf.simulate(scenario, seed=1)  # auto: in SimPy
+    if text is SLOTS:
+        F, Q, P, H, R = 1.1 * np.eye(1), 0.4 * np.eye(1), 2.0 * np.eye(1), np.eye(1), 0.5
+    else:
+        A, BB = np.array([[-0.1, 1.0], [0.0, -0.3]]), np.diag([0.04, 1.0])
+        both = scipy.linalg.expm(0.25 * np.block([[-A, BB], [np.zeros((2, 2)), A.T]]))
+        F, P, H, R = both[2:, 2:].T, np.array([[1.0, 0.2], [0.2, 2.0]]), np.eye(1, 2), 0.3
+        Q = F @ both[:2, 2:]
+    for row, t in enumerate(run.times[:-1]):
+        P = F @ P @ F.T + Q if row else P
+        reads = row and t % (1.0 if text is SLOTS else 0.5) == 0.0
+        for _ in range(sum(not is_down(t, node) for node in range(3)) if reads else 0):
+            P = P - P @ H.T @ H @ P / (H @ P @ H.T + R)
+        np.testing.assert_allclose(run.P[row], np.broadcast_to(P, run.P[row].shape), rtol=1e-9)
+    with pytest.raises(netkf.TheoryError, match="down at times"):
+        netkf.theory.error_covariance(scenario, run)
+    with pytest.raises(netkf.TheoryError, match="down at times"):
+        netkf.check(scenario, runs=20)
+
+
+@pytest.mark.parametrize("text", [SLOTS, CLOCKS], ids=["slots", "clocks"])
+def test_no_theory_counts_readings_of_nodes_that_are_down(scenario_of, text, tmp_path):
+    lives = '[[network.lives]]\nnodes = [0]\nkind = "duty"\nperiod = 4.0\nup = 2.0\n'
+    scenario = scenario_of(text, lives)
+    rows = netkf.sweep(scenario, {"seed": [1]}, runs=2, workers=1, engine="simpy")
+    assert np.isnan(rows[["bound", "central"]].to_numpy()).all()
+    with pytest.raises(netkf.TheoryError, match="down at times"):
+        netkf.size(scenario, "network.lives.0.up", 1.0, 3.0, "worst_trace<=1", by="theory")
+    run = netkf.simulate(scenario, engine="simpy")
+    summary = json.loads((netkf.save(run, scenario, tmp_path / "run") / "summary.json").read_text())
+    assert summary["central"] is None
+    assert [node["bound"] for node in summary["nodes"]] == 3 * [None]
+
+
+def test_a_sweep_takes_wrong_clocks(scenario_of):
+    clocks = "[[network.clocks]]\nnodes = [0]\noffset = 0.1\n"
+    swept = [
+        netkf.sweep(scenario_of(CLOCKS, lines), {"seed": [1]}, workers=1, engine="simpy")
+        for lines in (clocks, "")
+    ]
+    assert np.isnan(swept[0]["bound"]).all()  # filters believe stamps
+    assert swept[0]["central"].tolist() == swept[1]["central"].tolist()

@@ -167,3 +167,48 @@ def test_one_block_may_be_named_without_a_list():
     assert named.estimated == listed.estimated == robots.estimated
     with pytest.raises(netkf.ScenarioError, match=r'did you mean "own"\? names are "pose"'):
         robots.replace({"filter.estimates": "owm"})
+
+
+BIASES = """
+format = 1
+name = "biases"
+horizon = 3.0
+probe = 1.0
+filter = { kind = "central", estimates = ["target", "bias"] }
+[[plants]]
+name = "target"
+kind = "diffusion"
+A = [[0.0]]
+B = [[1.0]]
+cov = [[2.0]]
+[[plants]]
+name = "bias"
+nodes = [1]
+kind = "diffusion"
+A = [[0.0]]
+B = [[0.5]]
+cov = [[1.0]]
+[[sensors]]
+of = "bias"
+nodes = [1]
+H = [[1.0]]
+R = [[0.25]]
+sampling = { kind = "periodic", period = 1.0 }
+[network]
+graph = { kind = "path", nodes = 2 }
+activation = { kind = "poisson", rate = 1.0 }
+"""
+
+
+def test_a_node_estimates_those_of_the_named_blocks_that_it_has(tmp_path):
+    path = tmp_path / "biases.toml"
+    path.write_text(BIASES)
+    scenario = netkf.load(path)
+    run = netkf.simulate(scenario, engine="simpy")
+    assert run.block("bias", 1).P.ravel()[:2] == pytest.approx([1.0, 1.25 * 0.25 / 1.5])
+    assert run.block("target", 0).P.ravel()[:2] == pytest.approx([2.0, 3.0])
+    with pytest.raises(netkf.ScenarioError, match="must estimate block 'bias'"):
+        run.block("bias", 1, by=0)
+    for names, rule in [(["bias"], "node 0 has none"), (["biass"], "name of one of")]:
+        with pytest.raises(netkf.ScenarioError, match=rule):
+            scenario.replace({"filter.estimates": names})

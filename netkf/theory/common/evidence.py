@@ -74,6 +74,12 @@ def require_linear(scenario: Scenario, accepted: tuple[str, ...] = ()) -> None:
             raise TheoryError(evidence)
 
 
+def require_every_reading(scenario: Scenario) -> None:
+    """Raise TheoryError if nodes are down at times, and do not read then."""
+    if scenario.network.lives:
+        raise TheoryError(f"{LIVES}: what they read then is missing")
+
+
 def no_channel_law(scenario: Scenario) -> str:
     """Return why it is not known how often messages arrive, where :func:`lacks_channel_law`."""
     reason = "losses or delays are recorded, or nodes move"

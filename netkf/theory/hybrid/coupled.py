@@ -24,7 +24,7 @@ from netkf.network.spectra import connected_parts
 from netkf.plants.transitions import Transitions
 from netkf.scenario.registry import kind_name
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import no_channel_law, nonlinear_rows
+from netkf.theory.common.evidence import life_rows, no_channel_law, nonlinear_rows
 from netkf.theory.common.observations import increment_observations
 from netkf.theory.hybrid import dense
 from netkf.theory.hybrid.dense import FullMatrix, SparseOrFull, full_matrix, solve_or_nan
@@ -131,7 +131,7 @@ def reason_without_bound(scenario: Scenario) -> str | None:
 
 def _reason_of_samples(scenario: Scenario) -> str | None:
     """Return why the bound does not cover sensors that sample, or None if it does."""
-    for *_, evidence in nonlinear_rows(scenario):
+    for *_, evidence in nonlinear_rows(scenario) or life_rows(scenario):
         return f"not promised: {evidence}"
     for node, placed_sensor in randomly_sampled_sensors(scenario):
         clock = sampling_clock(scenario.sensors[placed_sensor.entry])

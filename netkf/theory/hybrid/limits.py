@@ -9,6 +9,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, block_diagonal
 from netkf.scenario.registry import kind_name, name_of
 from netkf.scenario.scenario import Scenario
+from netkf.theory.common.evidence import require_every_reading
 from netkf.theory.hybrid.coupled import (
     CoupledRiccati,
     increment_informations,
@@ -150,6 +151,7 @@ def _central_slot_covariance(scenario: Scenario) -> FloatArray:
         raise TheoryError("the filter's samples are predictions, the central filter's are not")
     if any(sensor.varying for sensor in scenario.sensors):
         raise TheoryError("H differs from slot to slot: there is no steady covariance")
+    require_every_reading(scenario)
     truth = [scenario.observation_matrices(node) for node in scenario.sensing_nodes]
     H = np.concatenate([np.zeros((0, plant.n)), *(H for H, _ in truth)])
     return filtered_covariance(plant.F, plant.Q, H, block_diagonal([R for _, R in truth]))
