@@ -27,6 +27,8 @@ from netkf.logs.packets import (
 
 NUMBERS = ("transctr", "pkctr", "txnumpk", "txifdur", "frequency")
 COLUMNS = ("timestamp", "mac", "srcmac", *NUMBERS, "crc", "expected")
+MAX_BURST = 100_000
+"""Packets of a burst; more make no sense."""
 PAUSE = 5.0
 """Seconds beyond its length after which rows of a burst's number belong to another one."""
 
@@ -86,20 +88,21 @@ def _read(path: Path, notes: list[str]) -> tuple[pd.DataFrame, list[Decimal]]:
     for what, flags in (("of no packet of the experiment", foreign), ("with a wrong crc", broken)):
         if flags.any():
             notes.append(f"dropped: {count_phrase(int(flags.sum()), 'row')} {what}")
-    if good.empty:
-        raise ScenarioError(str(path), "has no packet of the experiment", None, "check the file")
     numbers: dict[str, Any] = {name: parse_numbers(path, good, name) for name in NUMBERS}
     numbers["rssi"] = parse_numbers(path, good, "rssi") if "rssi" in good.columns else np.nan
     table = pd.DataFrame({"mac": good["mac"], "srcmac": good["srcmac"], **numbers})
     wrong = (table["txnumpk"] < 1) | (table["pkctr"] < 0) | (table["pkctr"] > table["txnumpk"])
     wrong |= (table["txifdur"] < 0) | (table["mac"] == table["srcmac"])
+    wrong |= (table["txnumpk"] > MAX_BURST) | (table["mac"] == "") | (table["srcmac"] == "")
     if wrong.any():
         lines = ", ".join(map(str, table.index[wrong][:3]))
         notes.append(
-            f"dropped: {count_phrase(int(wrong.sum()), 'row')} whose numbers make no sense "
+            f"dropped: {count_phrase(int(wrong.sum()), 'row')} whose entries make no sense "
             f"({path.name} line {lines}{', ...' if wrong.sum() > 3 else ''})"
         )
     good, table = good[~wrong], table[~wrong]
+    if good.empty:
+        raise ScenarioError(str(path), "has no packet of the experiment", None, "check the file")
     return table, parse_stamps(path, good, "timestamp")
 
 

@@ -40,13 +40,9 @@ def read_ulb(log: Path) -> PacketLog:
             raise ScenarioError(str(log), rule, None, "check the path")
         paths[name] = path
     notes: list[str] = []
-    raw = read_texts(paths["heard"])
-    for name in ("t", "sender", "receiver"):
-        if not find_column(raw, name):
-            rule = f"must have a column {name}"
-            raise ScenarioError(str(paths["heard"]), rule, list(raw.columns), "check the file")
+    raw = _read_named(paths["heard"], ("t", "sender", "receiver"))
     stamps = parse_stamps(paths["heard"], raw, find_column(raw, "t"))
-    texts = read_texts(paths["readings"])
+    texts = _read_named(paths["readings"], ("t", "node"))
     read_stamps = parse_stamps(paths["readings"], texts, find_column(texts, "t"))
     first = min(*stamps, *read_stamps)
     origin = Decimal(int(first // 60) * 60)  # minutes stay those of the stamps
@@ -87,6 +83,20 @@ def read_ulb(log: Path) -> PacketLog:
     if places is not None:
         result.positions = read_positions(places)
     return result
+
+
+def _read_named(path: Path, names: tuple[str, ...]) -> pd.DataFrame:
+    """Return a table of texts that has the columns ``names``, motes among them in every row."""
+    table = read_texts(path)
+    for name in names:
+        column = find_column(table, name)
+        if not column:
+            rule = f"must have a column {name}"
+            raise ScenarioError(str(path), rule, list(table.columns), "check the file")
+        if name != "t" and (blank := table[column] == "").any():
+            rule = f"line {table.index[blank][0]}: must name a {name}"
+            raise ScenarioError(str(path), rule, None, "correct the row")
+    return table
 
 
 def _broadcasts(readings: pd.DataFrame, reports: pd.DataFrame, notes: list[str]) -> pd.DataFrame:

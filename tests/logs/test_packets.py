@@ -244,6 +244,38 @@ def test_mercator(tmp_path):
     assert ((stamps <= received) & (received < stamps + 1)).all()
 
 
+@pytest.mark.parametrize("column", ["mac", "srcmac", "txnumpk"])
+def test_rows_of_mercator_that_make_no_sense_are_dropped(tmp_path, column):
+    """Motes without a name, and a burst of more packets than fit in memory."""
+    head, *rows = [line.split(",") for line in MERCATOR.splitlines()]
+    wrong = {"txnumpk": "1e12"}.get(column, "")
+    changed = [
+        [wrong if name == column else x for name, x in zip(head, row, strict=True)] for row in rows
+    ]
+    log = write(tmp_path / "raw.csv", [",".join(row) for row in (head, *rows, *changed)])
+    _, notes = netkf.import_log(log, "mercator", tmp_path / "out")
+    assert any("whose entries make no sense" in note for note in notes)
+    assert any("outcomes: 12 = 3 heard + 9 lost + 0 unknown" in note for note in notes)
+    log = write(tmp_path / "wrong.csv", [",".join(row) for row in (head, *changed)])
+    with pytest.raises(ScenarioError, match="has no packet of the experiment"):
+        netkf.import_log(log, "mercator", tmp_path / "none")
+
+
+@pytest.mark.parametrize(
+    ("readings", "heard", "rule"),
+    [
+        (["node,y", "1,2"], ["t,receiver,sender", "1,2,1"], "must have a column t"),
+        (["t,node,y", "1,,2"], ["t,receiver,sender", "1,2,1"], "line 2: must name a node"),
+        (["t,node,y", "1,1,2"], ["t,receiver,sender", "1,2,1", "1,,1"], "line 3: must name a rec"),
+    ],
+)
+def test_tables_of_ulb_name_motes_and_times(tmp_path, readings, heard, rule):
+    write(tmp_path / "readings.csv", readings)
+    write(tmp_path / "heard.csv", heard)
+    with pytest.raises(ScenarioError, match=rule):
+        netkf.import_log(tmp_path, "ulb", tmp_path / "out")
+
+
 def test_ulb_counts_missing_reports_as_unknown(tmp_path):
     log = tmp_path / "log"
     log.mkdir()
