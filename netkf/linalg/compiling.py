@@ -35,6 +35,7 @@ ROOMS = (
     "linalg",
     "rng",
     "core",
+    "network",
     "algorithms",
     "plants",
     "trace",
@@ -317,7 +318,7 @@ def _say_that_it_compiles() -> None:
         when = "once for each kind of filter"
         if not _folders_of_process.isdisjoint((folder, folder.parent)):
             when = "in each process: NUMBA_CACHE_DIR names no folder that only you can write"
-        print(f"netkf: compiling (up to 15 s), {when} ...", file=sys.stderr, flush=True)
+        print(f"netkf: compiling (up to half a minute), {when} ...", file=sys.stderr, flush=True)
     _announcing[0] = False
 
 

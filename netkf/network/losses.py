@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import itertools
 import math
 from abc import abstractmethod
@@ -10,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -32,6 +33,10 @@ from netkf.core.fields import (
 from netkf.core.laws import Chain
 from netkf.core.repeated_rows import RowUse, count_rows, first_rows
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import Kernel, kernel
+from netkf.linalg.functions import call_function
+from netkf.linalg.plain import is_plain
+from netkf.linalg.vector_functions import VectorFunction
 from netkf.network.graphs import Link, Topology, demand_links
 
 
@@ -471,6 +476,71 @@ class GilbertElliott(Loss):
         return Chain(*self.transitions, *delivery)
 
 
+MESSAGE = ("sender", "receiver", "number", "bad", "table_probability", "distance")
+"""What the kernel of a KernelLoss knows of a message, see Transmission, beside its time."""
+
+
+class KernelLoss(Loss):
+    """A loss whose delivery probability is computed by a kernel: in both engines one code, and in
+    the compiled one as fast as the built-in losses.
+
+    ``law(message, settings, t, out)`` is marked with ``netkf.kernels.kernel``. It writes the
+    probability into ``out[0]``, given the ``message``, of which it knows what MESSAGE names in this
+    order, the ``settings``, and the time ``t`` in seconds at which it is sent. All are floats.
+    """
+
+    vectorised = True
+    law: ClassVar[Any]
+
+    @property
+    def settings(self) -> FloatArray:
+        """The numbers (K,) that the kernel gets: by default the fields, in their order."""
+        return np.array([float(getattr(self, f.name)) for f in dataclasses.fields(self)])
+
+    @cached_property
+    def _function(self) -> tuple[VectorFunction, FloatArray]:
+        law, settings = inspect.getattr_static(type(self), "law", None), self.settings
+        law = getattr(law, "__func__", law)
+        if not (isinstance(law, Kernel) or (is_plain() and callable(law))):
+            raise TypeError(f"{type(self).__name__}.law must be a kernel (netkf.kernels.kernel)")
+        shapes = (len(MESSAGE),), settings.shape, (1,)
+        return VectorFunction(law, shapes, is_kernel=True), settings
+
+    def kernel_call(self) -> tuple[int, FloatArray]:
+        """Return the address of the compiled law (``linalg.functions``), and its settings."""
+        return self._function[0].address, self._function[1]
+
+    def describe(self, sent: Transmission) -> FloatArray:
+        """Return what the kernel knows of K messages ``sent`` on one link, (K, len(MESSAGE))."""
+        columns: tuple[Any, ...] = *sent.link, *(getattr(sent, name) for name in MESSAGE[2:])
+        rows = np.broadcast_arrays(*(np.atleast_1d(np.asarray(c, dtype=float)) for c in columns))
+        return np.stack(rows, axis=1)
+
+    def delivery_probability(self, sent: Transmission) -> Any:
+        """Return what the kernel says of the message, or of K messages on one link (K,)."""
+        messages = self.describe(sent)
+        times = np.array(np.broadcast_to(sent.time, len(messages)), dtype=np.float64)
+        out = np.empty((len(messages), 1))
+        fill_chances(*self.kernel_call(), messages, times, out)
+        return out[:, 0] if np.ndim(sent.number) else float(out[0, 0])
+
+
+@kernel
+def fill_chances(
+    address: int, settings: FloatArray, messages: FloatArray, times: FloatArray, out: FloatArray
+) -> None:
+    """Write the delivery probabilities (K, 1) of ``messages`` (K, M) sent at ``times`` (K,)."""
+    for k in range(len(times)):
+        call_function(address, messages[k], settings, times[k], 0.0, out[k])
+
+
+def law_in_kernels(loss: Loss) -> bool:
+    """Return True if a kernel alone says with which probability a message arrives."""
+    if not isinstance(loss, KernelLoss) or loss.stateful or has_conditions(loss):
+        return False
+    return type(loss).delivery_probability is KernelLoss.delivery_probability
+
+
 def identical_per_link(loss: Loss) -> bool:
     """Return True if a directed link has one delivery probability while nodes stay."""
     # By exact type: a subclass may override delivery_probability.
@@ -496,7 +566,7 @@ def delivery_probabilities(loss: Loss, sent: Transmission) -> FloatArray:
     """Return checked probabilities (K,) of messages ``sent`` on a link; raises ScenarioError."""
     if _is_vectorised(loss):
         values = np.broadcast_to(loss.delivery_probability(sent), np.shape(sent.number))
-        _demand_probabilities(loss, sent, values)
+        demand_probability(loss, sent, values)
         return np.asarray(values)
     columns = np.broadcast_arrays(sent.number, sent.time, sent.bad, sent.distance)[1:]
     rows = zip(sent.number.tolist(), *(c.tolist() for c in columns), strict=True)
@@ -511,11 +581,12 @@ def checked_delivery_probability(loss: Loss, sent: Transmission) -> float:
     """Return the probability that ``sent`` arrives; raises ScenarioError outside [0, 1]."""
     value: float = loss.delivery_probability(sent)
     if not 0.0 <= value <= 1.0:
-        _demand_probabilities(loss, sent, np.array(value))
+        demand_probability(loss, sent, np.array(value))
     return value
 
 
-def _demand_probabilities(loss: Loss, sent: Transmission, values: FloatArray) -> None:
+def demand_probability(loss: Loss, sent: Transmission, values: FloatArray) -> None:
+    """Raise ScenarioError unless the probabilities of messages ``sent`` on a link are in [0, 1]."""
     is_right = (values >= 0.0) & (values <= 1.0)
     if is_right.all():
         return
@@ -526,4 +597,6 @@ def _demand_probabilities(loss: Loss, sent: Transmission, values: FloatArray) ->
         f"{list(sent.link)} must be in [0, 1]"
     )
     remedy = "correct delivery_probability of the class"
+    if isinstance(loss, KernelLoss):
+        remedy = "correct the law of the class"
     raise ScenarioError("network.channel.loss", rule, float(values.ravel()[wrong[0]]), remedy)

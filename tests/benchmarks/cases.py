@@ -1,10 +1,13 @@
 """The scenarios of the benchmarks."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 import netkf
+from netkf.kernels import kernel
+from netkf.parts import KernelLoss, probability, setting
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 
@@ -147,5 +150,20 @@ def push_sum_with(**channel):
     return short.replace({f"network.channel.{key}": value for key, value in channel.items()})
 
 
+@kernel
+def even(_message, settings, _t, out):
+    out[0] = settings[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Even(KernelLoss):
+    """Bernoulli losses as a user writes them."""
+
+    law = even
+
+    delivery: float = setting(probability)
+
+
+BY_KERNEL = {"kind": f"{__name__}:Even", "delivery": 0.7}
 SHARED = {"kind": "shared", "delivery": 0.7, "share": 0.3}
 LATE = {"kind": "uniform", "low": 0.0, "high": 0.05}

@@ -33,7 +33,7 @@ def kernel(name, make, limit):
 
 
 def tables(**channel):
-    """Runs whose messages in slots are tables, against runs whose messages kernels draw."""
+    """Runs with another channel in slots, against runs with Bernoulli losses."""
     return ensembles(cases.push_sum_with(**channel), 16), ensembles(cases.push_sum_with(), 16)
 
 
@@ -132,6 +132,7 @@ ROWS = [
     kernel("intermittent, n = 1, 60 slots", partial(cases.load, "intermittent_scalar"), 3.0),
     kernel("intersection, radio, 53 motes, n = 4", partial(cases.load, "intel_lab_radio"), 3.0),
     kernel("intersection, radio, 300 nodes, n = 4", partial(cases.radio, 300), 3.0),
+    Row("Bernoulli losses: law as kernel", "run", partial(tables, loss=cases.BY_KERNEL), 3.0, True),
     Row("Bernoulli losses: fate shared", "run", partial(tables, loss=cases.SHARED), 12.0, True),
     Row("Bernoulli losses: and delays", "run", partial(tables, delay=cases.LATE), 12.0, True),
     Row("batched numpy: gossip, ring of 5", "run", batched_numpy, 5.0, False),

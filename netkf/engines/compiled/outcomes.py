@@ -17,6 +17,7 @@ from netkf.engines.compiled.moving_links import MovingLinks
 from netkf.engines.compiled.senders import Senders
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.functions import call_function
 from netkf.network.channels import (
     BroadcastDraw,
     Channel,
@@ -36,13 +37,17 @@ from netkf.network.delays import (
 )
 from netkf.network.graphs import Link
 from netkf.network.losses import (
+    MESSAGE,
     Bernoulli,
     DistanceLoss,
     GilbertElliott,
+    KernelLoss,
     Loss,
     NoLoss,
     PerLink,
     Transmission,
+    demand_probability,
+    law_in_kernels,
 )
 from netkf.network.radio import Airtime
 from netkf.rng.draws import Ziggurat, next_exponential, next_unit, ziggurat
@@ -59,6 +64,26 @@ LOSSES = (NoLoss, Bernoulli, PerLink, DistanceLoss, GilbertElliott)
 DELAYS = (NoDelay, ConstantDelay, ExponentialDelay, UniformDelay, LognormalDelay)
 FIXED, EXPONENTIAL, UNIFORM, LOGNORMAL, LISTED = range(5)
 """Laws of delays; outcomes that are LISTED were drawn in Python."""
+NUMBER = MESSAGE.index("number")
+
+
+class Chances(NamedTuple):
+    """The law of a KernelLoss for the messages of R runs on W directions.
+
+    address, settings : of the kernel (``linalg.functions``); 0: the law is a built-in one
+    first : (W, M), the first message of each direction as the kernel knows it
+    sent : (R W,), the number of messages so far
+    message, out : (M,) and (1,), scratch
+    wrong : (4,), direction, number, time and probability of a message, where that is none; -1 first
+    """
+
+    address: int
+    settings: FloatArray
+    first: FloatArray
+    sent: IntArray
+    message: FloatArray
+    out: FloatArray
+    wrong: FloatArray
 
 
 class ChannelStreams(NamedTuple):
@@ -67,6 +92,7 @@ class ChannelStreams(NamedTuple):
     source : (W,), stream of each direction, within a run
     per_run : S
     delivery : (2, W), delivery probabilities in the good and the bad state of the link
+    chances : the delivery probabilities of a KernelLoss
     loss, state, delay : (R S, WIDTH), states of the random streams; (0, WIDTH): nothing is drawn
     bad : (R S,), state of each link (1: bad), -1 at first
     to_bad, to_good : transition probabilities of that state
@@ -78,6 +104,7 @@ class ChannelStreams(NamedTuple):
     source: IntArray
     per_run: int
     delivery: FloatArray
+    chances: Chances
     loss: np.ndarray
     state: np.ndarray
     delay: np.ndarray
@@ -101,12 +128,13 @@ def draw_outcomes(
     outgoing: IntArray,
     first: int,
     after: int,
+    t: float,
     out: FloatArray,
     counts: IntArray,
 ) -> int:
-    """Draw which messages of a tick arrive on the directed links ``outgoing[first:after]``, and
-    append their delays (seconds or LOST) to ``out`` at ``counts[1]``. Return the ``first_outcome``
-    of the tick, see TickBuffer.
+    """Draw which messages of a tick at ``t`` seconds arrive on the directed links
+    ``outgoing[first:after]``, and append their delays (seconds or LOST) to ``out`` at
+    ``counts[1]``. Return the ``first_outcome`` of the tick, see TickBuffer.
     """
     outcome, uniform, bad, last = 0 if channels.bits else counts[1], 0.0, 0, -1
     delay = channels.scale
@@ -129,13 +157,36 @@ def draw_outcomes(
                     bad = next_state(channels, k)
                 if channels.law != FIXED:
                     delay = draw_delay(channels, k)
-            arrives = uniform < channels.delivery[bad, w]
+            arrives = uniform < chance_of(channels, run, w, bad, t)
         if channels.bits:
             outcome |= np.int64(arrives) << (m - first)
         else:
             out[counts[1]] = delay if arrives or channels.law == LISTED else LOST
             counts[1] += 1
     return outcome
+
+
+@kernel(inlined=True)
+def chance_of(channels: ChannelStreams, run: int, w: int, bad: int, t: float) -> float:
+    """Return the delivery probability of the next message on direction ``w``, sent at ``t``."""
+    if channels.chances.address == 0:
+        return float(channels.delivery[bad, w])
+    return _chance_by_law(channels.chances, run, w, t)
+
+
+@kernel
+def _chance_by_law(chances: Chances, run: int, w: int, t: float) -> float:
+    k, message = run * len(chances.first) + w, chances.message
+    for i in range(len(message)):
+        message[i] = chances.first[w, i]
+    message[NUMBER] = chances.sent[k]
+    call_function(chances.address, message, chances.settings, t, 0.0, chances.out)
+    chance = chances.out[0]
+    if not 0.0 <= chance <= 1.0 and chances.wrong[0] < 0.0:
+        chances.wrong[0], chances.wrong[1] = w, chances.sent[k]
+        chances.wrong[2], chances.wrong[3] = t, chance
+    chances.sent[k] += 1
+    return float(chance)
 
 
 @kernel
@@ -304,7 +355,10 @@ def draws_in_kernels(network: Network) -> bool:
     """Return True if kernels can draw the outcomes of messages."""
     channel = network.channel
     # By exact type: a subclass may override the law.
-    has_known_law = type(channel.loss) in LOSSES and type(channel.delay) in DELAYS
+    has_known_law = type(channel.loss) in LOSSES
+    # Who is down sends nothing, and the messages of a KernelLoss are counted.
+    has_known_law |= law_in_kernels(channel.loss) and not network.lives
+    has_known_law &= type(channel.delay) in DELAYS
     return has_known_law and network.radio is None and draws_per_link(channel)
 
 
@@ -321,9 +375,12 @@ def channel_streams(
     delivery: FloatArray,
     bits: bool = False,
     listed: Sequence[FloatArray] = (),
+    first: Sequence[Transmission] = (),
 ) -> ChannelStreams:
     """Return the losses and delays of all runs, before anything is drawn. ``bits``: outcomes are
-    arrival bits. ``listed``: the outcomes of each direction of each run, of a user's channel.
+    arrival bits. ``first``: the first message of each direction, where the loss is a KernelLoss
+    whose kernel is called for each. ``listed``: the outcomes of each direction of each run, of a
+    user's channel.
     """
     none: np.ndarray = np.empty((0, WIDTH), dtype=np.uint64)
     loss, delay = channel.loss, channel.delay
@@ -343,6 +400,7 @@ def channel_streams(
         source=senders.source,
         per_run=len(sources),
         delivery=delivery,
+        chances=_chances_of(loss, first, streams.runs),
         loss=none if listed or loss.deterministic else streams.states("loss", sources),
         state=streams.states("weather", sources) if loss.stateful and not listed else none,
         delay=streams.states("delay", sources) if delay.is_random and not listed else none,
@@ -358,6 +416,31 @@ def channel_streams(
         listed=np.concatenate([np.empty(0), *listed]),
         following=np.cumsum([0, *map(len, listed)], dtype=np.int64)[:-1],
     )
+
+
+def _chances_of(loss: Loss, first: Sequence[Transmission], runs: int) -> Chances:
+    address, settings, messages = 0, np.zeros(0), np.zeros((0, len(MESSAGE)))
+    if first:
+        assert isinstance(loss, KernelLoss)
+        address, settings = loss.kernel_call()
+        messages = np.concatenate([loss.describe(sent) for sent in first])
+    return Chances(
+        address=address,
+        settings=settings,
+        first=messages,
+        sent=np.zeros(len(messages) * runs, dtype=np.int64),
+        message=np.zeros(len(MESSAGE)),
+        out=np.zeros(1),
+        wrong=np.full(4, -1.0),
+    )
+
+
+def demand_probabilities(loss: Loss, channels: ChannelStreams, directions: Sequence[Link]) -> None:
+    """Raise ScenarioError if a KernelLoss gave a message a probability outside [0, 1]."""
+    w, number, time, value = channels.chances.wrong.tolist()
+    if w >= 0.0:
+        sent = Transmission(directions[int(w)], number=int(number), time=time)
+        demand_probability(loss, sent, np.array(value))
 
 
 def delivery_table(scenario: Scenario, loss: Loss, directions: Sequence[Link]) -> FloatArray:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.core.instants import snapped
-from netkf.engines.compiled.outcomes import ChannelStreams, next_state
+from netkf.engines.compiled.outcomes import ChannelStreams, chance_of, next_state
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import Lanes, load_flags, select, spread, store
@@ -58,6 +58,7 @@ class SlotChannels(NamedTuple):
     uniform : (R S,), the last uniform number of each stream, -1 at first
     ends : (links, 2), indices of nodes; direction 2 l goes from the first to the second
     talks : (E, W), 1 if the sender of a direction has something to send in a step
+    begin : (S, E), when steps begin, in seconds; (0, 0) where losses do not depend on it
     per_link : directions of a link, 1 or 2
     """
 
@@ -65,6 +66,7 @@ class SlotChannels(NamedTuple):
     uniform: FloatArray
     ends: np.ndarray
     talks: np.ndarray
+    begin: FloatArray
     per_link: int
 
 
@@ -169,19 +171,21 @@ def draw_messages(
     for b in range(up.shape[0]):
         for s in range(up.shape[1]):
             for e in range(up.shape[2] if exchanged[s] else 0):
-                arrived = up[b, s, e]
+                arrived, now = up[b, s, e], links.begin[s, e] if len(links.begin) > 0 else 0.0
                 for r in range(b * len(lanes), min((b + 1) * len(lanes), runs)):
                     for a in range(messages.pair_count[r, s, e] if matched else len(links.ends)):
                         link = messages.active[r, s, e, a] if matched else a
-                        draw_link(links, r, link, fresh[e], e, arrived, r - b * len(lanes))
+                        q = r - b * len(lanes)
+                        draw_link(links, r, link, fresh[e], e, now, arrived, q)
 
 
 @kernel
 def draw_link(
-    links: SlotChannels, r: int, link: int, fresh: bool, e: int, up: np.ndarray, q: int
+    links: SlotChannels, r: int, link: int, fresh: bool, e: int, t: float, up: np.ndarray, q: int
 ) -> None:
-    """Draw which messages of one activation of ``link`` arrive in step ``e`` of run ``r``, into
-    lane ``q`` of ``up`` (W, L). Unless it is ``fresh`` a link keeps its last draws.
+    """Draw which messages of one activation of ``link`` arrive in step ``e`` of run ``r``, which
+    begins at ``t`` seconds, into lane ``q`` of ``up`` (W, L). Unless it is ``fresh`` a link keeps
+    its last draws.
     """
     channels, uniform, last = links.channels, links.uniform, -1
     for w in range(link * links.per_link, (link + 1) * links.per_link):
@@ -194,7 +198,7 @@ def draw_link(
                 next_state(channels, k)
         last = k
         if links.talks[e, w] == 1:
-            up[w, q] = uniform[k] < channels.delivery[max(channels.bad[k], 0), w]
+            up[w, q] = uniform[k] < chance_of(channels, r, w, max(channels.bad[k], 0), t)
 
 
 @kernel

@@ -22,7 +22,7 @@ from netkf.algorithms.kernels.pairs import Pairs
 from netkf.core.memory import ReusableMemory, keep_freed_memory
 from netkf.engines.base import Progress
 from netkf.engines.compiled.gates import REFUSE, count_refusals, with_refusals
-from netkf.engines.compiled.outcomes import channel_streams
+from netkf.engines.compiled.outcomes import channel_streams, demand_probabilities
 from netkf.engines.compiled.own_sensors import read_whitened
 from netkf.engines.compiled.samples import by_node, record_samples
 from netkf.engines.compiled.slot_filters import SlotFilters
@@ -212,11 +212,15 @@ class SlotRuns:
 
     def _begin_messages(self) -> None:
         setup, streams = self.setup, self._streams
-        channels = channel_streams(setup.channel, streams, setup.senders, setup.delivery)
+        self._calls_law = setup.is_drawn and setup.law_in_kernels
+        first = [self._scenario.transmission(w) for w in setup.directions if self._calls_law]
+        channels = channel_streams(
+            setup.channel, streams, setup.senders, setup.delivery, first=first
+        )
         # -1: nothing drawn yet.
         uniform = np.full(len(channels.bad), -1.0)
         self._channels = SlotChannels(
-            channels, uniform, setup.ends, setup.talks, setup.directions_per_link
+            channels, uniform, setup.ends, setup.talks, np.zeros((0, 0)), setup.directions_per_link
         )
         if setup.algorithm.timing.randomised:
             self._triggers = streams.states("trigger", [(node,) for node in setup.nodes.tolist()])
@@ -395,7 +399,12 @@ class SlotRuns:
             draw_pairs(
                 self._matchings, setup.ends, times.exchanged, messages.active, messages.pair_count
             )
-        draw_messages(MANY, self._channels, times.exchanged, setup.fresh, messages, self.runs)
+        channels = self._channels
+        if self._calls_law:
+            begin = step_times(self._scenario, setup, times.first, len(times.start)).begin
+            channels = channels._replace(begin=np.ascontiguousarray(begin))
+        draw_messages(MANY, channels, times.exchanged, setup.fresh, messages, self.runs)
+        demand_probabilities(setup.channel.loss, channels.channels, setup.directions)
         if decided:
             self._mark_senders(messages, times.exchanged)
         # No chosen messages at all: the run as it was.

@@ -36,7 +36,7 @@ from netkf.linalg.portable import cholesky, solve_lower
 from netkf.network.channels import draws_per_link
 from netkf.network.deliveries import Deliveries, DeliveringLoss
 from netkf.network.graphs import Link
-from netkf.network.losses import GilbertElliott, identical_per_link
+from netkf.network.losses import GilbertElliott, identical_per_link, law_in_kernels
 from netkf.network.matchings import PROTOCOLS, Broadcast, Matching, maximal_matchings
 from netkf.plants.regressors import RegressorSensor
 from netkf.plants.slot_paths import SlotSensors
@@ -359,10 +359,11 @@ class SlotSetup:
         self.channel, loss = channel, channel.loss
         # Numpy computes the probabilities of a user's own loss model (slot_tables).
         has_known_law = identical_per_link(loss) or type(loss) is GilbertElliott
-        has_known_law &= scenario.network.radio is None
+        self.law_in_kernels = law_in_kernels(loss)
+        has_known_law = (has_known_law or self.law_in_kernels) and scenario.network.radio is None
         self.has_known_probabilities = has_known_law and draws_per_link(channel)
         self.delivery = np.ones((2, len(self.directions)))
-        if self.has_known_probabilities:
+        if self.has_known_probabilities and not self.law_in_kernels:
             self.delivery = delivery_table(scenario, loss, self.directions)
         # Some filters send nothing in some phases, the exchanges of a slot (push-sum with
         # asymptotic gains: no mass), or only from nodes that have sensors.
@@ -407,7 +408,8 @@ class SlotSetup:
     def _draws_everything(self, scenario: Scenario) -> bool:
         network = scenario.network
         # Which message has which number is known before the exchange, unless nodes may be silent.
-        if self.deliveries is not None and (self.decides or self.may_miss):
+        is_numbered = self.deliveries is not None or self.law_in_kernels
+        if is_numbered and (self.decides or self.may_miss):
             return False
         if scenario.links_move or scenario.network.lives:
             return False

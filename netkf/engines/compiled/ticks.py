@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ from netkf.engines.compiled.outcomes import (
     ChannelStreams,
     channel_streams,
     delivery_table,
+    demand_probabilities,
     draw_outcomes,
     draws_in_kernels,
     list_outcomes,
@@ -32,6 +34,7 @@ from netkf.engines.compiled.state import Instants, TickArrays
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.network.clocks import LinkClock, Periodic, Poisson, Renewal
+from netkf.network.losses import Transmission, law_in_kernels
 from netkf.rng.draws import Ziggurat, fill_units, next_exponential, next_unit, ziggurat
 from netkf.rng.numbers import NormalZiggurat, next_gamma, normal_ziggurat
 from netkf.rng.streams import ReplicaStreams, Streams
@@ -125,7 +128,7 @@ def draw_ticks(
                 return False
             buffer.t[m], buffer.entity[m] = instant, e
             buffer.first_outcome[m] = draw_outcomes(
-                channels, run, clocks.outgoing, first, after, buffer.delay, counts
+                channels, run, clocks.outgoing, first, after, instant, buffer.delay, counts
             )
             m += 1
             # The next tick is drawn now: it may lie in the next window.
@@ -513,8 +516,12 @@ class Schedule:
         if scenario.links_move and listed is not None:
             self._moving = moving_links(scenario, senders, listed, truth, lives.is_down)
         delivery, outcomes = np.ones((2, len(senders.directions))), []
+        first: list[Transmission] = []
         if draws_in_kernels(scenario.network) and self._moving is None:
-            delivery = _delivery(scenario)
+            if law_in_kernels(channel.loss):
+                first = [scenario.transmission(w) for w in senders.directions]
+            else:
+                delivery = _delivery(scenario)
         elif listed is not None:
             heard = self._moving
             if scenario.network.lives and heard is None:
@@ -527,7 +534,10 @@ class Schedule:
             clock, senders.entities, rates, streams, purposes, scenario.time_grid.per_second
         )._replace(first=senders.first, outgoing=senders.outgoing)
         self._clocks = clocks if listed is None else _listed_clocks(clocks, listed)
-        self._channels = channel_streams(channel, streams, senders, delivery, bits, outcomes)
+        self._channels = channel_streams(channel, streams, senders, delivery, bits, outcomes, first)
+        self._demand = partial(
+            demand_probabilities, channel.loss, self._channels, senders.directions
+        )
         start_clocks(self._clocks, ziggurat(), normal_ziggurat())
         self._rate = float(rates.sum())
         # Mean number of messages for each tick.
@@ -560,6 +570,7 @@ class Schedule:
         clocks, channels = self._clocks, self._channels
         states: list[np.ndarray] = [clocks.next_tick, clocks.number, clocks.streams]
         states += [channels.loss, channels.state, channels.delay, channels.bad, channels.following]
+        states += [channels.chances.sent]
         # Copies of the streams: an attempt that runs out of space starts again from them.
         copies = [state.copy() for state in states]
         # Space for the mean plus eight standard deviations of a Poisson count; in the rare case of
@@ -571,6 +582,7 @@ class Schedule:
             buffer, ticks = self._space(max_ticks), self._space_for_all(total)
             scratch = buffer, np.zeros(2, dtype=np.int64), _sorting(max_ticks)
             if draw_all_ticks(clocks, channels, self._horizon, *scratch, ticks):
+                self._demand()
                 return ticks
             spread *= 2.0
             for state, copy in zip(states, copies, strict=True):
@@ -599,6 +611,7 @@ class Schedule:
                 break
             # The ticks so far stay in the buffer: the kernel continues where it stopped.
             ticks, sends = 2 * ticks, 2 * sends
+        self._demand()
         count = int(counts[0])
         ordered = _empty_buffer(count, 0)._replace(delay=self._buffer.delay[: counts[1]].copy())
         if self._clocks.crowds:
