@@ -523,19 +523,18 @@ def test_all_of_the_range_and_none_of_it(short):
 
 
 def test_a_target_that_only_the_middle_reaches(build):
-    """The offset of a Kalman filter's first estimate, which is wrong on both sides of the truth."""
-    scenario = build(**SCALAR, filter={"kind": "local", "mean": [0.0]}).replace({"horizon": 3.0})
-    P, shrunk, squares = 2.0, 1.0, []
+    """P of a plant with x[k+1] = F x[k] + w[k] is large for large F of either sign."""
+    scenario = build(**SCALAR, filter={"kind": "local"}).replace({"horizon": 3.0})
+    P, found_P = 2.0, []
     for _ in range(3):
-        P = 1.1**2 * P + 1.0
-        gain = P / (P + 0.5)
-        P, shrunk = (1.0 - gain) * P, 1.1 * (1.0 - gain) * shrunk
-        squares.append([P, shrunk**2])
-    P, shrunk = np.mean(squares, axis=0)
-    target = f"worst_rms<={np.sqrt(P + shrunk):.12g}"  # so that offsets up to 1 reach it
-    found = size(scenario, "filter.mean.0", -10.0, 9.0, target, engine="simpy", workers=1)
-    assert 0.9 <= abs(found.value) <= 1.0
-    assert 1.0 <= abs(found.misses) <= 1.1
+        P = 0.9**2 * P + 1.0
+        P = P - P * P / (P + 0.5)
+        found_P.append(P)
+    target = f"mean_trace<={np.mean(found_P):.12g}"  # so that F from -0.9 to 0.9 reaches it
+    found = size(scenario, "plant.F.0.0", -1.5, 1.3, target)
+    assert found.by == "theory"
+    assert abs(found.value) == pytest.approx(0.9, abs=2e-4)
+    assert abs(found.misses) == pytest.approx(0.9, abs=2e-4)
     assert "NOT monotone" in found.sure
     assert "reaches" in format_answer(found)
     every = size(scenario, "sensors.0.H.0.0", -2.0, -1.0, "mean_trace<=9", by="theory")
