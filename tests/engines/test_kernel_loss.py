@@ -101,9 +101,14 @@ def test_a_law_as_kernel_is_the_law(name: str, monkeypatch: pytest.MonkeyPatch) 
 
 def test_who_may_be_silent_or_down_has_its_messages_numbered_as_in_simpy() -> None:
     """Then Python counts the messages, and the kernel is called for many at once."""
-    fast = hub("gossip_ring", Hub, 8.0)
-    down = {"kind": "crashes", "mean_up": 4.0, "mean_down": 2.0}
-    assert_agree(fast.replace({"network.lives": [{"nodes": [0, 1], **down}]}))
+    down = {"nodes": [0, 1], "kind": "crashes", "mean_up": 4.0, "mean_down": 2.0}
+    assert_agree(hub("gossip_ring", Hub, 8.0).replace({"network.lives": [down]}))
+    clocked = hub("poisson_ring", Hub, 4.0)
+    sampled = {
+        f"sensors[{k}].sampling": {"kind": "periodic", "period": 0.5}
+        for k in range(len(clocked.sensors))
+    }
+    assert_agree(clocked.replace({"network.lives": [down], **sampled}))
 
 
 def test_probabilities_that_are_none_are_refused_in_one_line() -> None:
