@@ -26,6 +26,7 @@ from netkf.logs.packets import (
 )
 
 NUMBERS = ("transctr", "pkctr", "txnumpk", "txifdur", "frequency")
+YES = ("1", "1.0", "true")
 COLUMNS = ("timestamp", "mac", "srcmac", *NUMBERS, "crc", "expected")
 MAX_BURST = 100_000
 """Packets of a burst; more make no sense."""
@@ -82,8 +83,9 @@ def _read(path: Path, notes: list[str]) -> tuple[pd.DataFrame, list[Decimal]]:
     if missing:
         rule = f"must have the columns of mercator; there is no {missing[0]}"
         raise ScenarioError(str(path), rule, list(raw.columns), "check the file, or --kind")
-    foreign, broken = raw["expected"] != "1", (raw["crc"] != "1") & (raw["expected"] == "1")
-    good = raw[~foreign & ~broken]
+    # Tables that have been through pandas say True or 1.0.
+    expected, right = (raw[name].str.lower().isin(YES) for name in ("expected", "crc"))
+    foreign, broken, good = ~expected, expected & ~right, raw[expected & right]
     notes.append(f"used: {path.name}: {len(good):,} of {count_phrase(len(raw), 'row')}")
     for what, flags in (("of no packet of the experiment", foreign), ("with a wrong crc", broken)):
         if flags.any():

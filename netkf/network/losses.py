@@ -513,7 +513,9 @@ class KernelLoss(Loss):
     def describe(self, sent: Transmission) -> FloatArray:
         """Return what the kernel knows of K messages ``sent`` on one link, (K, len(MESSAGE))."""
         columns: tuple[Any, ...] = *sent.link, *(getattr(sent, name) for name in MESSAGE[2:])
-        rows = np.broadcast_arrays(*(np.atleast_1d(np.asarray(c, dtype=float)) for c in columns))
+        if np.ndim(sent.number) == 0:  # SimPy asks for one at a time
+            return np.array([columns], dtype=np.float64)
+        rows = np.broadcast_arrays(*(np.asarray(c, dtype=np.float64) for c in columns))
         return np.stack(rows, axis=1)
 
     def delivery_probability(self, sent: Transmission) -> Any:

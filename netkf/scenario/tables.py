@@ -43,6 +43,8 @@ UNKNOWN = "is not a key here"
 TABLES = ("plant", "network", "filter")
 BLOCK_KEYS = ("name", "nodes", "coupling", "position", "means")
 """Keys in one of [[plants]], beside those of its plant."""
+OF_BLOCKS = ("coupling", "position", "means")
+"""Those of them that no other table has."""
 FILTERING_KEYS = ("mean", "cov", "model", "linearise", "estimates", "gate")
 """Keys of the table of a filter, beside those of its kind."""
 
@@ -217,6 +219,8 @@ def _check_keys(
         if key not in fields:
             allowed_keys = [*other_keys, *fields]
             remedy = f"{suggest_nearest(key, allowed_keys)}keys are {', '.join(allowed_keys)}"
+            if key in OF_BLOCKS:
+                remedy += f"; {key} stands in an entry of [[plants]], beside nodes"
             raise ScenarioError(key, UNKNOWN, value, remedy)
     for name, field in fields.items():
         if field.default is dataclasses.MISSING and name not in values:

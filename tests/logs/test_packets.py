@@ -219,8 +219,12 @@ def test_counters_begin_again():
     assert (np.diff(counters) == 1).all()
 
 
-def test_mercator(tmp_path):
-    log = write(tmp_path / "raw.csv", MERCATOR.splitlines())
+@pytest.mark.parametrize(("yes", "no"), [("1", "0"), ("True", "False"), ("1.0", "0.0")])
+def test_mercator(tmp_path, yes, no):
+    lines = [line.split(",") for line in MERCATOR.splitlines()]
+    for line in lines[1:]:
+        line[5:7] = (yes if flag == "1" else no for flag in line[5:7])
+    log = write(tmp_path / "raw.csv", [",".join(line) for line in lines])
     _, notes = netkf.import_log(log, "mercator", tmp_path / "out")
     text = "\n".join(notes)
     for note in (

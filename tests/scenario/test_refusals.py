@@ -175,6 +175,12 @@ PLANT = [
     ("plant-missing", {"plant": None}, "plant", "is missing"),
     ("plant-text", {"plant": '"diffusion"'}, "plant", "must be a table; got 'diffusion'"),
     ("plant-list", {"plant": '[{ kind = "diffusion" }]'}, "plant", "must be a table; got [{"),
+    (
+        "plant-of-blocks",
+        {"plant.position": "[0]"},
+        "plant.position",
+        "an entry of [[plants]], beside",
+    ),
     ("plant-kind-missing", {"plant.kind": None}, "plant.kind", "is missing"),
     ("plant-kind", {"plant.kind": '"difusion"'}, "plant.kind", "got 'difusion'"),
     ("plant-kind-number", {"plant.kind": "7"}, "plant.kind", "got 7"),
