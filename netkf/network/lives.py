@@ -196,7 +196,7 @@ class Lifetime(NamedTuple):
 
 def lifetimes(scenario: Any, streams: Any) -> dict[int, Lifetime]:
     """Return the lives of a run by the ids of the nodes that have one."""
-    found = {}
+    found, forgetful = {}, set(scenario.forgetful_nodes)
     for life in scenario.network.lives:
         for node in life.nodes:
 
@@ -208,7 +208,7 @@ def lifetimes(scenario: Any, streams: Any) -> dict[int, Lifetime]:
             changes = life.changes(node, random, scenario.end_time)
             up = not changes or not changes[0].up
             instants = [c._replace(time=scenario.time_grid.instant(c.time)) for c in changes]
-            forgets = node in scenario.forgetful_nodes
+            forgets = node in forgetful
             if forgets and scenario.slotted:
                 instants = _begun_with_slots(instants, scenario.slot_plant)
             kept = tuple(c for c in instants if c.time < scenario.end_time)

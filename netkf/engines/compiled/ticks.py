@@ -464,10 +464,14 @@ def _rates(scenario: Scenario) -> FloatArray:
 
 
 @once_per_scenario
-def _delivery(scenario: Scenario) -> FloatArray:
-    """Return the delivery probabilities (2, W) of a built-in channel, by state and direction."""
-    directions = senders_of(scenario).directions
-    return delivery_table(scenario, scenario.network.channel.loss, directions)
+def _law_of_messages(scenario: Scenario) -> tuple[FloatArray, list[Transmission]]:
+    """Return the delivery probabilities (2, W) of a built-in loss, by state and direction, and for
+    a KernelLoss the first message of each direction.
+    """
+    directions, loss = senders_of(scenario).directions, scenario.network.channel.loss
+    if law_in_kernels(loss):
+        return np.ones((2, len(directions))), [scenario.transmission(w) for w in directions]
+    return delivery_table(scenario, loss, directions), []
 
 
 def _listed_ticks(
@@ -518,10 +522,7 @@ class Schedule:
         delivery, outcomes = np.ones((2, len(senders.directions))), []
         first: list[Transmission] = []
         if draws_in_kernels(scenario.network) and self._moving is None:
-            if law_in_kernels(channel.loss):
-                first = [scenario.transmission(w) for w in senders.directions]
-            else:
-                delivery = _delivery(scenario)
+            delivery, first = _law_of_messages(scenario)
         elif listed is not None:
             heard = self._moving
             if scenario.network.lives and heard is None:
