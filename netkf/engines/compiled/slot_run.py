@@ -45,6 +45,7 @@ from netkf.engines.compiled.slot_messages import (
     Tracing,
     count_arrivals,
     count_sends,
+    draw_by_link,
     draw_messages,
     draw_pairs,
     draw_uniforms,
@@ -75,6 +76,7 @@ from netkf.trace.recorder import LONG, Recorder
 from netkf.trace.run import StateSamples
 from netkf.trace.schema import EVENT, KINDS
 
+CACHED = 1 << 18  # bytes of the processor's cache for arrival bits
 NEVER, _ALL = np.iinfo(np.int64).max, np.zeros((0, 0), dtype=np.int64)
 _samples = ReusableMemory(BATCH_BYTES)
 
@@ -222,6 +224,13 @@ class SlotRuns:
         self._channels = SlotChannels(
             channels, uniform, setup.ends, setup.talks, np.zeros((0, 0)), setup.directions_per_link
         )
+        # Draws of all links, anew in each slot, with probabilities that stay, may be made link by
+        # link: in as many slots as have arrival bits in the processor's cache.
+        self._units: FloatArray | None = None
+        keeps = len(channels.state) or self._calls_law or not setup.fresh[:1].any()
+        if len(channels.loss) and setup.matching[0] < 0 and not keeps:
+            steps, bits = len(setup.fresh), len(setup.fresh) * len(setup.directions) * LANES
+            self._units = np.empty(steps * max(1, CACHED // bits))
         if setup.algorithm.timing.randomised:
             self._triggers = streams.states("trigger", [(node,) for node in setup.nodes.tolist()])
         self._matchings = setup.matchings(streams.states("matching", [()]))
@@ -403,7 +412,11 @@ class SlotRuns:
         if self._calls_law:
             begin = step_times(self._scenario, setup, times.first, len(times.start)).begin
             channels = channels._replace(begin=np.ascontiguousarray(begin))
-        draw_messages(MANY, channels, times.exchanged, setup.fresh, messages, self.runs)
+        if self._units is not None:
+            up, fresh = messages.up, setup.fresh
+            draw_by_link(MANY, channels, times.exchanged, fresh, up, self._units, self.runs)
+        else:
+            draw_messages(MANY, channels, times.exchanged, setup.fresh, messages, self.runs)
         demand_probabilities(setup.channel.loss, channels.channels, setup.directions)
         if decided:
             self._mark_senders(messages, times.exchanged)
