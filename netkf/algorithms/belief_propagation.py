@@ -39,7 +39,7 @@ from netkf.algorithms.kernels.run import carry_mean, predict_estimate, shift_vec
 from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.models import SlotModel
 from netkf.algorithms.modes import ModeFrame, flow_frame, slot_frame, still_frame
-from netkf.algorithms.records import Kernels, Record
+from netkf.algorithms.records import Kernels, Record, triangle_numbers
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.traits import Analysis, Needs, Timing
 from netkf.core.errors import ScenarioError
@@ -363,6 +363,7 @@ def belief_propagation_record(
         node={**node, "frame": (kept, kept), "step": (kept,), "elapsed": ()},
         link={"received": part, "heard_at": ()},
         payload={"evidence": part, "xhat": (n,), "centre": (n,)},
+        numbers={"evidence": triangle_numbers(n, 1)[0]},
         scratch={"suffix": (1 + max(info.degree for info in infos), *part)},
         settings={
             "steps": filtering.steps,

@@ -60,8 +60,11 @@ def absorb(record: Any, h: int, run: Any) -> None:
         # A weight of 0 adds no information.
         if run.message_weight[k] > 0.0:
             m = run.message[k]
+            # What messages of few bits tell of the root has another inverse than what was sent.
+            untold = not any_lane(load(lanes, payload.inverse, m, 0, 0) != 0.0)
             if run.age[k] > 0.0:
                 carry(run.model, run, payload.xhat, payload.root, m, run.age[k])
+            if untold or run.age[k] > 0.0:
                 invert_lanes(lanes, run.size, payload.inverse, m, payload.root, m)
             arrived = load_flags(lanes, run.arrived, k)
             weight = select(arrived, run.message_weight[k] / divisor, 0.0)
@@ -80,6 +83,7 @@ def diffusion_filter_record(
     return Record(
         node={"own": (), "inverse": (n, n)},
         payload={"xhat": (n,), "root": (n, n), "inverse": (n, n)},
+        numbers={"inverse": np.full((n, n), -1)},
         settings={"keep_own": filtering.on_loss == "keep-own"},
     )
 

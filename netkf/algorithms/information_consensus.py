@@ -33,7 +33,7 @@ from netkf.algorithms.kernels.information import add_reading_pair, copy_part, we
 from netkf.algorithms.kernels.intersection import finish_lanes, invert_lanes, merge_lanes, whiten
 from netkf.algorithms.kernels.neighbours import received_weight
 from netkf.algorithms.models import SlotModel
-from netkf.algorithms.records import Kernels, Record
+from netkf.algorithms.records import Kernels, Record, triangle_numbers
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.starts import check_information, information_notes
 from netkf.algorithms.traits import CLOCKS, Analysis, Needs, Timing
@@ -131,6 +131,7 @@ def information_consensus_record(
     return Record(
         node={**pairs, "inverse": (n, n)},
         payload={"xhat": (n,), **pairs},
+        numbers={"parts": triangle_numbers(n, len(shares))},
         settings={"shares": shares, "counts": counts, "steps": filtering.steps},
     )
 

@@ -43,7 +43,7 @@ from netkf.algorithms.kernels.run import predict_estimate, shift_vector, write_i
 from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.kernels.triggers import is_positive
 from netkf.algorithms.models import SlotModel
-from netkf.algorithms.records import Kernels, Record
+from netkf.algorithms.records import Kernels, Record, packed_numbers
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.starts import check_information, information_notes
 from netkf.algorithms.traits import Analysis, Needs, Timing
@@ -466,6 +466,7 @@ def push_sum_record(filtering: PushSum, infos: Sequence[NodeInfo], models: Seque
         },
         link={"heard": (m if running else 0,)},
         payload={"mass": (m,), "xhat": (n,)},
+        numbers={"mass": packed_numbers(n, 2)},
         scratch={
             "before": (m,),
             "new_information": (n, n),

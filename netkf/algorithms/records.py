@@ -39,6 +39,9 @@ class Record:
     link : shapes of what a node knows for each of its incoming links
     link_start : values of these at time 0, where they are not 0
     payload : shapes of what a message carries
+    numbers : of its fields whose entries are not one number each: which number an entry is, from 0;
+              entries that have one number are equal, and those with -1 are not sent: they are 0
+              where payloads are quantised. Of ``root`` by default the lower triangle
     scratch : shapes of arrays for intermediate results, shared by all nodes
     settings : numbers, arrays and structs that are the same in all runs
     """
@@ -49,8 +52,27 @@ class Record:
     link: Shapes = field(default_factory=dict)
     link_start: Mapping[str, Any] = field(default_factory=dict)
     payload: Shapes = field(default_factory=dict)
+    numbers: Mapping[str, IntArray] = field(default_factory=dict)
     scratch: Shapes = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
+
+
+def triangle_numbers(n: int, *count: int) -> IntArray:
+    """Return the numbers of a lower triangular matrix (n, n), or of ``count`` roots (n, n + 1) of
+    information.
+    """
+    sent = np.ones((*count, n, n + len(count)), dtype=bool)
+    sent[..., :n] = np.tri(n, dtype=bool)
+    return np.where(sent, np.cumsum(sent).reshape(sent.shape) - 1, -1)
+
+
+def packed_numbers(n: int, before: int, after: int = 0) -> IntArray:
+    """Return the numbers of a vector with a symmetric matrix (n, n) by rows after ``before`` and
+    before ``after`` other numbers.
+    """
+    lower = triangle_numbers(n)
+    matrix, rest = before + np.maximum(lower, lower.T).ravel(), before + n * (n + 1) // 2
+    return np.concatenate([np.arange(before), matrix, np.arange(rest, rest + after)])
 
 
 def estimate_shapes(n: int) -> dict[str, tuple[int, ...]]:
@@ -196,12 +218,14 @@ class Records:
     struct : its fields are the arrays of the first block, ``payload`` and the settings
     arrays : of nodes (B, H, ..., L) and links (B, W, ..., L)
     links, past : names of those of links, and of past events
+    numbers : which numbers are sent of the fields of ``payload``, as ``Record.numbers``
     """
 
     struct: Any
     arrays: dict[str, np.ndarray]
     links: tuple[str, ...] = ()
     past: tuple[str, ...] = ()
+    numbers: Mapping[str, IntArray] = field(default_factory=dict)
 
     def place(self, name: str, h: int, first: IntArray) -> int | slice:
         """Return where the array ``name`` has what node ``h`` knows: its row, or the rows of its
@@ -276,8 +300,12 @@ def make_records(
     values |= record.settings
     if record.past:
         values["room"] = FIRST_PAST
+    numbers = {
+        **({"root": triangle_numbers(n)} if "root" in record.payload else {}),
+        **record.numbers,
+    }
     return Records(
-        record_class(name, values)(**values), arrays, tuple(per_link), tuple(record.past)
+        record_class(name, values)(**values), arrays, tuple(per_link), tuple(record.past), numbers
     )
 
 

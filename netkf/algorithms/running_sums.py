@@ -44,7 +44,7 @@ from netkf.algorithms.kernels.root_flow import cell_of, transition_series
 from netkf.algorithms.kernels.run import predict_estimate, shift_vector, use_reading
 from netkf.algorithms.kernels.square_root import triangularise
 from netkf.algorithms.modes import RateGroups, rate_groups
-from netkf.algorithms.records import Kernels, Record
+from netkf.algorithms.records import Kernels, Record, packed_numbers
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.generic import drop_lane
@@ -82,6 +82,7 @@ def record(infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
         },
         link={"heard": (m,), "heard_at": (), "number": ((), np.int64)},
         payload={"total": (m,), "number": ((), np.int64)},
+        numbers={"total": packed_numbers(n, 1, m - 1 - n * n)},
         settings={
             "receivers": np.array([info.receivers for info in infos], dtype=np.int64),
             "nodes": float(infos[0].nodes),

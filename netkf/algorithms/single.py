@@ -7,7 +7,7 @@ that it may change, so that states are values as those of filters in plain Pytho
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,7 +36,7 @@ from netkf.algorithms.models import (
 from netkf.algorithms.python_pairs import PythonPairs
 from netkf.algorithms.records import Kernels, Records, double_past, make_records
 from netkf.linalg.addresses import call_kernel
-from netkf.linalg.arrays import FloatArray, address_of
+from netkf.linalg.arrays import FloatArray, IntArray, address_of
 from netkf.linalg.lanes import ONE
 from netkf.linalg.structs import Size
 
@@ -178,6 +178,7 @@ class Surroundings:
         self.model, self.period = model, getattr(model, "period", 0.0)
         self.clocked = isinstance(model, FlowModel)
         self._piece = 0
+        self.numbers: Mapping[str, IntArray] = {}
         self._pairs = PythonPairs(info, n) if filtering.needs.blocks else None
         # Not unrolled: one compiled kernel serves all n.
         size, cls = size_of(n, unrolled=False), _run_class(model)
@@ -310,6 +311,7 @@ def begin(filtering: Any, model: Any, mean: FloatArray, cov: FloatArray, info: A
     nodes = tuple(name for name in fields if name not in records.links)
     kernels = filtering.kernels.of(isinstance(model, FlowModel))
     run = Surroundings(filtering, model, info, nodes, records.past)
+    run.numbers = records.numbers
     return NodeState(kernels, records.struct, fields, run)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from netkf.core.fields import Component, field, integer, positive
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, IntArray
 
 MAX_BITS = 48
 """More would be beyond the digits of a float64."""
@@ -60,8 +60,9 @@ class Encoder:
             return self._encode_array(payload) if payload.dtype == np.float64 else (payload, 0)
         if hasattr(payload, "fields"):
             # Messages of kernels: rows of single payloads, with an axis of lanes behind.
+            numbers = payload.sender.run.numbers
             rows = {
-                name: [self.encode(row[..., 0]) for row in values]
+                name: [self._encode_field(row[..., 0], numbers.get(name)) for row in values]
                 for name, values in payload.fields.items()
             }
             arrays = {k: np.array([row for row, _ in v])[..., None] for k, v in rows.items()}
@@ -71,6 +72,14 @@ class Encoder:
             make = getattr(payload, "_make", tuple)
             return make([part for part, _ in parts]), sum(count for _, count in parts)
         return payload, 0
+
+    def _encode_field(self, values: np.ndarray, numbers: IntArray | None) -> tuple[Any, int]:
+        """Quantise an array whose entries are these ``numbers``, see ``Record.numbers``."""
+        if numbers is None or values.dtype != np.float64:
+            return self.encode(values)
+        first = np.unique(numbers[numbers >= 0], return_index=True)[1]
+        sent, count = self._quantisation.apply(values[numbers >= 0][first], self._random)
+        return np.append(sent, 0.0)[numbers], count
 
     def _encode_array(self, values: FloatArray) -> tuple[FloatArray, int]:
         is_square = values.ndim == 2 and values.shape[0] == values.shape[1]

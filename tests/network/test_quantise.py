@@ -12,6 +12,7 @@ from netkf.engines.simpy.engine import SimpyEngine
 from netkf.network.quantise import Encoder, Quantisation
 from netkf.rng.streams import Streams
 from netkf.runs.summary import PromisedTraces, SummarySink, summarise
+from netkf.scenario.reading import from_table
 from netkf.trace.recorder import Recorder
 from netkf.trace.schema import CODES
 
@@ -119,6 +120,93 @@ def plain_run(slots, bits, limit, seed):
 def test_hearers_use_what_is_received_all_the_same(scenario_of):
     run = netkf.simulate(scenario_of(Q=0.0, R=1e-24), seed=5)
     np.testing.assert_allclose(run.xhat[:, :, 0], plain_run(31, 3, 8.0, 5), rtol=1e-9, atol=1e-9)
+
+
+def plain_intersection(slots, bits, limit, seed):
+    """Estimates and P (T, 3) of the diffusion filter with metropolis weights, of the same state:
+    hearers invert the P that they receive.
+    """
+    draws = [Streams(seed).generator("dither", i) for i in range(3)]
+    step, x, P = 2.0 * limit / 2.0**bits, np.full(3, 0.5), np.ones(3)
+    found = [(x, P)]
+    for k in range(slots - 1):
+        gain = P / (P + 0.5)
+        x, P = 0.9 * (x + gain * (2.0 * 0.9**k - x)), 0.81 * (1.0 - gain) * P + 0.1
+        u = step * (np.array([random.random(2) for random in draws]).T - 0.5)
+        level = np.floor((np.array([x, np.sqrt(P)]) + u + limit) / step)
+        told, root = (np.clip(level, 0.0, 2.0**bits - 1.0) + 0.5) * step - limit - u
+        # Row i has what node i uses: its own and those heard.
+        own = np.eye(3, dtype=bool)
+        information = np.where(own, 1.0 / P[:, None], root**-2.0) / 3.0
+        P = 1.0 / information.sum(axis=1)
+        x = P * (information * np.where(own, x[:, None], told)).sum(axis=1)
+        found.append((x, P))
+    return np.array(found).transpose(1, 0, 2)
+
+
+def test_what_follows_from_other_numbers_of_a_message_is_not_sent(scenario_of):
+    scenario = scenario_of(bits=6, Q=0.0, R=1e-24, filter_="diffusion").replace(
+        {"filter.model": {"Q": [[0.1]], "R": [[0.5]]}}
+    )
+    run = netkf.simulate(scenario, seed=5, engine="simpy")
+    xhat, P = plain_intersection(31, 6, 8.0, 5)
+    np.testing.assert_allclose(run.xhat[:, :, 0], xhat, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(run.P[:, :, 0, 0], P, rtol=1e-9, atol=1e-9)
+
+
+N3 = 3
+TRIANGLE = N3 * (N3 + 1) // 2
+PLANTS = {
+    "slots": {"kind": "linear", "period": 1.0, "F": 0.9 * np.eye(N3), "Q": np.zeros((N3, N3))},
+    "clocks": {"kind": "diffusion", "A": -0.1 * np.eye(N3), "B": np.zeros((N3, N3))},
+}
+
+
+@pytest.mark.parametrize(
+    ("time", "filtering", "numbers"),
+    [
+        # An estimate with its covariance; information relative to an estimate.
+        ("slots", {"kind": "diffusion"}, N3 + TRIANGLE),
+        ("slots", {"kind": "hcmci"}, 2 * (N3 + TRIANGLE) + N3),
+        ("slots", {"kind": "icf"}, N3 + TRIANGLE + N3),
+        # Mass, or the estimates of the second exchange: the other one is zero.
+        ("slots", {"kind": "push-sum", "gamma": 1, "delta": 4.0}, 2 + TRIANGLE + N3),
+        ("clocks", {"kind": "covariance-intersection", "epsilon": 0.3}, N3 + TRIANGLE),
+        ("clocks", {"kind": "push-sum"}, 1 + N3 + TRIANGLE),
+        # Each neighbour is told another thing, and so would be others: two payloads at the ends.
+        ("clocks", {"kind": "belief-propagation"}, 2 * (N3 + TRIANGLE + 2 * N3)),
+    ],
+)
+def test_each_number_of_a_message_is_sent_once(time, filtering, numbers, monkeypatch, tmp_path):
+    sizes, apply = [], Quantisation.apply
+
+    def counted(self, values, random):
+        sizes.append(values.size)
+        return apply(self, values, random)
+
+    monkeypatch.setattr(Quantisation, "apply", counted)
+    sampling = {"sampling": {"kind": "periodic", "period": 1.0}} if time == "clocks" else {}
+    activation = {"kind": "broadcast"}
+    if time == "clocks":
+        activation = {"kind": "periodic", "period": 0.7, "at": "nodes"}
+    table = {
+        "format": 1,
+        "name": "numbers",
+        "horizon": 3.0,
+        "probe": [0.0, 1.0],
+        "plant": PLANTS[time] | {"cov": np.eye(N3)},
+        "sensors": [{"nodes": [0, 1], "H": [[1.0, 0.5, 0.2]], "R": [[1.0]], **sampling}],
+        "network": {
+            "graph": {"kind": "path", "nodes": 2},
+            "activation": activation,
+            "quantise": {"bits": 20, "range": 100.0},
+        },
+        "filter": filtering,
+    }
+    run = netkf.simulate(from_table(table, tmp_path), engine="simpy")
+    # Of two nodes each has one hearer.
+    assert run.count("send") > 0
+    assert sum(sizes) == numbers * run.count("send")
 
 
 def test_the_steady_error_is_that_of_the_plain_recursion(scenario_of):
