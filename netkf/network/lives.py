@@ -27,6 +27,7 @@ from netkf.core.fields import (
     source_file,
 )
 from netkf.core.repeated_rows import RowUse, count_rows, first_rows
+from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Topology, demand_in_graph
 
 UP, DOWN = ("restart", "join"), ("crash", "leave")
@@ -151,6 +152,11 @@ class RecordedLife(Life):
                 rule = f"{table.where(before, row)}: node {node} is {state} already"
                 raise ScenarioError("path", rule, time, "correct the rows of the node")
         return found, keys
+
+    @property
+    def rows(self) -> FloatArray:
+        """The times (K,) of all rows in seconds, in the order of the table."""
+        return np.array([t for _, t in self._table[1]])
 
     def use(self, end: float) -> RowUse:
         """Return the use of the rows by a run to ``end`` (s): those after 0, and the last one until

@@ -98,8 +98,12 @@ class NodeTime(NamedTuple):
         return self.pace * time - ahead
 
     def instants(self, ticks: FloatArray, ahead: float) -> FloatArray:
-        """Return instants of ``ticks`` (K,), in s of their law, without those before the start."""
-        times = self.grid.snap((ticks + ahead) / self.pace)
+        """Return instants of ``ticks`` (K,), in s of their law, without those before the start.
+
+        What the clock shows is snapped first: all that it does at one reading is one instant.
+        """
+        shown = self.grid.snap(ticks + (ahead + self.offset))
+        times = self.grid.snap((shown - self.offset) / self.pace)
         return times[times > 0.0] if ahead < 0.0 else times
 
 

@@ -14,6 +14,7 @@ from netkf.core.csv_files import read_columns
 from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.fields import Component, SourceFile, field, one_of, source_file
 from netkf.core.repeated_rows import RowUse, count_rows, first_rows
+from netkf.linalg.arrays import FloatArray
 from netkf.network.delays import Delay
 from netkf.network.graphs import Link, Topology, demand_links
 from netkf.network.losses import Loss, Transmission
@@ -164,10 +165,14 @@ class RecordedDelay(_Recorded, Delay):
         return 0.0
 
     @property
+    def rows(self) -> FloatArray:
+        """The delays (K,) of all listed messages in seconds."""
+        return np.array([value for link in self.table.values.values() for value in link.values()])
+
+    @property
     def longest(self) -> float:
         """The largest recorded delay in seconds."""
-        listed = [value for link in self.table.values.values() for value in link.values()]
-        return max(listed, default=0.0)
+        return float(np.max(self.rows, initial=0.0))
 
     def message_delay(self, sent: Transmission, drawn: float) -> float:
         """Return the recorded seconds that the message ``sent`` takes."""

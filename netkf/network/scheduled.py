@@ -22,6 +22,7 @@ from netkf.core.fields import (
     probability,
     source_file,
 )
+from netkf.core.instants import OnGrid
 from netkf.core.repeated_rows import RowUse, count_rows, first_rows
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Link, Topology, demand_links
@@ -43,13 +44,14 @@ def _read_deliveries(
 
 
 @dataclass(frozen=True, eq=False)
-class ScheduledLoss(Loss):
+class ScheduledLoss(Loss, OnGrid):
     """A message arrives with the probability that a table ``from,until,sender,receiver,delivery``
     gives its direction at the time when it is sent: a row holds from its beginning to before its
     end, and outside all rows ``otherwise`` does.
     """
 
     vectorised = True
+    grid_values = ("_instants",)
 
     path: SourceFile = field(source_file)
     otherwise: float = field(probability, default=1.0)
@@ -94,6 +96,11 @@ class ScheduledLoss(Loss):
         lines = {link: int(table.lines[numbers[0]]) for link, numbers in rows.items()}
         return steps, lines, keys
 
+    @cached_property
+    def _instants(self) -> dict[Link, FloatArray]:
+        """The times (K,) by link on the grid of the scenario, as messages are sent."""
+        return {link: self.time_grid.snap(times) for link, (times, _) in self._steps[0].items()}
+
     def use(self, end: float) -> RowUse:
         """Return the use of the rows by a run to ``end`` (s): of those that hold in it."""
         return count_rows(self.path.name, self._steps[2], lambda key: key[1] < end and key[2] > 0.0)
@@ -102,7 +109,7 @@ class ScheduledLoss(Loss):
         """Return the probability of the direction at the time of sending."""
         if sent.link not in self._steps[0]:
             return self.otherwise
-        times, probabilities = self._steps[0][sent.link]
+        times, probabilities = self._instants[sent.link], self._steps[0][sent.link][1]
         # Of a row that begins where another ends the last entry counts.
         return probabilities[np.searchsorted(times, sent.time, side="right") - 1]
 

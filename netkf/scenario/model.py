@@ -420,6 +420,10 @@ class ScenarioModel(Component):
             activation = network.activation.on_grid(grid)
             if activation is not network.activation:
                 network = dataclasses.replace(network, activation=activation)
+        loss = network.channel.loss
+        if isinstance(loss, OnGrid) and loss.on_grid(grid) is not loss:
+            channel = dataclasses.replace(network.channel, loss=loss.on_grid(grid))
+            network = dataclasses.replace(network, channel=channel)
         algorithm = snap_limits(filtering.algorithm, grid)
         if algorithm is not filtering.algorithm:
             filtering = dataclasses.replace(filtering, algorithm=algorithm)
@@ -656,7 +660,7 @@ class ScenarioModel(Component):
         """Return the fault that a sensor of ``node`` (id) has at some time, or None."""
         fault: Fault | None = self.sensors[placed_sensor.entry].fault
         has_it = fault is not None and (fault.nodes is None or node in fault.nodes)
-        return fault if has_it else None
+        return snap_limits(fault, self.time_grid) if has_it else None
 
     @cached_property
     def faults(self) -> dict[int, tuple[tuple[PlacedSensor, Fault], ...]]:

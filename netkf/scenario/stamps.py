@@ -141,7 +141,8 @@ def stamp_notes(scenario: Any) -> tuple[str, ...]:
     )
 
 
-def _recorded_times(scenario: Any) -> Iterator[FloatArray]:
+def recorded_ticks(scenario: Any) -> Iterator[FloatArray]:
+    """Yield the times (K,) in seconds of the rows of each table of readings, samples or ticks."""
     for sensor in scenario.sensors:
         if sensor.record is not None:
             yield sensor.record.columns["t"]
@@ -152,6 +153,10 @@ def _recorded_times(scenario: Any) -> Iterator[FloatArray]:
         yield scenario.network.activation.rows
     if isinstance(scenario.network.activation, Contacts):
         yield np.array([t for _, *ends in scenario.network.activation.row_keys for t in ends])
+
+
+def _recorded_times(scenario: Any) -> Iterator[FloatArray]:
+    yield from recorded_ticks(scenario)
     positions = scenario.position_table
     if positions is not None and positions.timed:
         yield np.array([t for _, t in positions.row_keys])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Iterator
 from fractions import Fraction
@@ -12,14 +13,26 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import Component
-from netkf.core.instants import COARSEST, FINEST, MAX_REFINE, MAX_TICKS, TimeGrid, as_fraction
+from netkf.core.instants import (
+    CLOSE,
+    COARSEST,
+    FINEST,
+    MAX_REFINE,
+    MAX_TICKS,
+    TimeGrid,
+    as_fraction,
+)
 from netkf.core.laws import Lattice
 from netkf.linalg.spectra import eigenvalues
 from netkf.network.clocks import Poisson
+from netkf.network.lives import RecordedLife
 from netkf.network.matchings import SlotActivation
+from netkf.network.recorded import RecordedDelay
 from netkf.plants.diffusion import Diffusion
+from netkf.scenario.stamps import recorded_ticks
 
-LISTED = 64  # of a list of probe times, how many are looked at
+LISTED = 64  # of a list of probe times, or of a table, how many are looked at
+DECIMALS = 9  # times of tables that have no more decimals are not looked at
 FAR = 1e3  # a tick is far below a time of so many ticks
 
 
@@ -47,8 +60,9 @@ def _choose_automatically(scenario: Any) -> TimeGrid:
     # Not of probes, which no instant depends on, nor of the horizon: what is recorded, and for how
     # long, must not change a run.
     constants = (c for c in _time_constants(scenario) if c.key not in ("horizon", "probe"))
-    for constant in () if scenario.time.refine else constants:
-        finer = math.lcm(refine, _odd_part(constant))
+    exact = itertools.chain((c.exact for c in constants), _added_times(scenario))
+    for time in () if scenario.time.refine else exact:
+        finer = math.lcm(refine, _odd_part(time))
         # Of many odd denominators the first ones count; the others leave a note.
         if finer <= min(MAX_REFINE, MAX_TICKS / horizon):
             refine = finer
@@ -59,9 +73,28 @@ def _choose_automatically(scenario: Any) -> TimeGrid:
     return TimeGrid(10.0**COARSEST)
 
 
-def _odd_part(constant: TimeConstant) -> int:
+def _added_times(scenario: Any) -> Iterator[Fraction | None]:
+    """Yield times beside those of fields that instants are sums of: what a bit takes on air, by how
+    much clocks are off, and times of tables, if all of those that are looked at are rational.
+    """
+    network = scenario.network
+    if network.radio is not None and network.radio.bits_per_second is not None:
+        rate = as_fraction(network.radio.bits_per_second)
+        yield None if rate is None else 1 / rate
+    yield from (as_fraction(c.offset) for c in network.clocks if isinstance(c.offset, float))
+    for times in itertools.chain(
+        () if scenario.slotted else recorded_ticks(scenario),
+        (life.rows for life in network.lives if isinstance(life, RecordedLife)),
+        [network.channel.delay.rows] if isinstance(network.channel.delay, RecordedDelay) else (),
+    ):
+        odd = times[np.abs(times - times.round(DECIMALS)) > CLOSE * np.abs(times)]
+        exact = [as_fraction(time) for time in np.unique(odd)[:LISTED].tolist()]
+        yield from () if None in exact else exact
+
+
+def _odd_part(exact: Fraction | None) -> int:
     """Return the part of the denominator of a time that no power of ten is divisible by."""
-    part = 1 if constant.exact is None else constant.exact.denominator
+    part = 1 if exact is None else exact.denominator
     for prime in (2, 5):
         while part % prime == 0:
             part //= prime
@@ -79,6 +112,7 @@ def _time_constants(scenario: Any) -> Iterator[TimeConstant]:
         *((scenario.sensor_key(k), sensor) for k, sensor in enumerate(scenario.sensors)),
         ("network.activation", network.activation),
         ("network.channel.delay", network.channel.delay),
+        *((f"network.lives[{k}]", life) for k, life in enumerate(network.lives)),
         ("filter", scenario.filter.algorithm),
     ):
         yield from _times_of(key, part)
@@ -123,13 +157,13 @@ def _step_lengths(scenario: Any) -> Iterator[TimeConstant]:
             yield TimeConstant("network.activation.phase", length / steps, share)
 
 
-def snap_limits(algorithm: Any, grid: TimeGrid) -> Any:
-    """Return a filter whose times, which ages are compared with, are on the ``grid``."""
-    if not isinstance(algorithm, Component):
-        return algorithm
+def snap_limits(part: Any, grid: TimeGrid) -> Any:
+    """Return a part whose times, which ages or instants are compared with, are on the ``grid``."""
+    if not isinstance(part, Component):
+        return part
     times = {
-        field.name: getattr(algorithm, field.name)
-        for field in dataclasses.fields(algorithm)
+        field.name: getattr(part, field.name)
+        for field in dataclasses.fields(part)
         if field.init and field.metadata.get("rule") and field.metadata["rule"].of_time
     }
     changed = {
@@ -137,7 +171,7 @@ def snap_limits(algorithm: Any, grid: TimeGrid) -> Any:
         for name, value in times.items()
         if isinstance(value, float) and 0.0 < grid.instant(value) != value
     }
-    return dataclasses.replace(algorithm, **changed) if changed else algorithm
+    return dataclasses.replace(part, **changed) if changed else part
 
 
 def check_grid(scenario: Any) -> None:

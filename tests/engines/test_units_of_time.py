@@ -237,3 +237,91 @@ def agree(scenario):
     assert simpy.fingerprint == compiled.fingerprint
     assert simpy.log.tobytes() == compiled.log.tobytes()
     np.testing.assert_allclose(compiled.P, simpy.P, rtol=1e-10, atol=1e-12)
+
+
+def written(folder, unit, kind):
+    """A scenario whose ticks are those of a table, every unit, and in which one other thing, of a
+    ``kind``, has times in that unit: so that no period tells the grid of time about it.
+    """
+    folder.mkdir()
+    ticks = [f"{k * unit!r},{i},{i + 1}" for k in range(1, 30) for i in range(3)]
+    ways = [(i, j) for i in range(4) for j in (i - 1, i + 1) if 0 <= j < 4]
+    delays = [f"{i},{j},{m},{(1 + (i + m) % 3) * unit!r}" for i, j in ways for m in range(29)]
+    fades = [f"{5 * unit!r},{11 * unit!r},{i},{j},0" for i, j in ways]
+    for name, header, rows in (
+        ("ticks.csv", "t,node,peer", ticks),
+        ("delays.csv", "sender,receiver,message,seconds", delays),
+        ("fades.csv", "from,until,sender,receiver,delivery", fades),
+        ("lives.csv", "t,node,what", [f"{4 * unit!r},1,down", f"{9 * unit!r},1,up"]),
+    ):
+        (folder / name).write_text("\n".join([header, *rows]) + "\n")
+    base = clocked(unit, {"kind": "local"}, {"kind": "readings"}, FINE, NONE).plant
+    plant = {"kind": "diffusion", "A": base.A, "B": base.B, "cov": base.cov}
+    sampling = {"kind": "poisson", "rate": 0.5 / unit}
+    sensors = [{"nodes": [0, 2], "H": [[1.0, 0.0]], "R": [[0.1]], "sampling": sampling}]
+    activation = {"kind": "recorded", "at": "links", "path": "ticks.csv"}
+    loss, delay, more = {"kind": "none"}, {"kind": "none"}, {}
+    if kind == "delays":
+        delay = {"kind": "recorded", "path": "delays.csv"}
+    elif kind == "losses":
+        loss = {"kind": "scheduled", "path": "fades.csv"}
+    elif kind == "lives":
+        more = {"lives": [{"kind": "duty", "nodes": [1], "period": 7 * unit, "up": 3 * unit}]}
+        more["lives"] += [{"kind": "recorded", "nodes": [2], "path": "late.csv"}]
+        rows = (folder / "lives.csv").read_text().replace(",1,", ",2,")
+        (folder / "late.csv").write_text(rows)
+    elif kind == "radio":  # two means and the triangle of P: 320 bits, a unit
+        more = {"radio": {"bits_per_second": 320.0 / unit, "queue": "wait"}}
+    elif kind == "clocks":
+        more = {"clocks": [{"nodes": [0], "offset": 2 * unit, "drift": 0.03}]}
+        sensors[0]["sampling"] = {"kind": "periodic", "period": 3 * unit}
+        rows = "".join(f"{k * unit!r},0\n" for k in range(3, 60, 3))
+        (folder / "samples.csv").write_text("t,node\n" + rows)
+        table = {"kind": "recorded", "path": "samples.csv"}
+        sensors.append({**sensors[0], "nodes": [0], "sampling": table})
+    network = {"graph": {"kind": "path", "nodes": NODES}, "activation": activation, **more}
+    return from_table(
+        {
+            "format": 1,
+            "name": "written",
+            "horizon": 30 * unit,
+            "probe": 5 * unit,
+            "plant": plant,
+            "sensors": sensors,
+            "network": {**network, "channel": {"loss": loss, "delay": delay}},
+            "filter": {"kind": "hybrid", "epsilon": 0.2},
+        },
+        folder,
+    )
+
+
+@pytest.mark.parametrize("unit", [1 / 12, 1 / 60], ids=["1/12 s", "1/60 s"])
+@pytest.mark.parametrize("kind", ["delays", "losses", "lives", "radio", "clocks"])
+def test_whatever_makes_instants_is_in_the_unit(kind, unit, tmp_path):
+    run, other = (
+        netkf.simulate(written(tmp_path / str(k), u, kind), engine="simpy")
+        for k, u in enumerate((1.0, unit))
+    )
+    compare(run, other, unit)
+    # What happens at whole units meets the ticks there, and no tick is beside one of them.
+    events = run.events
+    if kind in ("delays", "radio"):
+        assert events.t[events.kind.isin(["tick", "deliver"])].nunique() == 29
+    if kind == "clocks":  # both sensors of the node read when its clock shows the same
+        for events in (run.events, other.events):
+            assert events[(events.kind == "sense") & (events.node == 0)].t.nunique() == 10
+
+
+def test_the_ends_of_a_fault_belong_to_it(tmp_path):
+    """Also where the grid of time holds fewer digits than they are written with."""
+    t = 1.23456789012347
+    (tmp_path / "samples.csv").write_text(f"t,node\n1.0,0\n{t!r},0\n")
+    fault = {"kind": "biased", "since": t, "until": t, "size": 1e6}
+    sensor = {"nodes": [0], "H": [[1.0, 0.0]], "R": [[0.04]], "fault": fault}
+    sensor["sampling"] = {"kind": "recorded", "path": "samples.csv"}
+    plant = {"kind": "diffusion", "A": np.zeros((2, 2)), "B": [[0.0], [0.5]], "cov": np.eye(2)}
+    scenario = made(1.0, plant, [sensor], {"kind": "readings"}, NONE, {"kind": "local"}, tmp_path)
+    assert scenario.time_grid.instant(t) > t
+    xhat = netkf.simulate(scenario.replace({"probe": [1.0, 2.0]}), engine="simpy").xhat[:, 0]
+    assert np.abs(xhat[0]).max() < 1e3
+    assert np.abs(xhat[1]).max() > 1e5
