@@ -76,12 +76,8 @@ class CompiledEngine(Engine):
         network, rule = scenario.network, ""
         if network.quantise:
             rule = "messages of few bits"
-        elif network.radio and scenario.views is not None:
-            rule = "radios of nodes that estimate different states"
         elif network.lives and scenario.node_filter.timing.pooled:
             rule = "nodes that are down at times, with a filter that reads all sensors"
-        elif network.lives and scenario.slotted and scenario.views is not None:
-            rule = "nodes that are down at times and estimate different states in slots"
         elif (ungated := ungated_readings(scenario)) is not None:
             rule = f"a gate on {ungated}"
         if rule:
