@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -19,7 +19,7 @@ from netkf.core.notebook import NotebookTable
 from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import Progress
 from netkf.figures.names import FIT_FILE
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.logs import outcomes as stats
 from netkf.logs.envelope import COLUMNS, Interval, Law, compare_with_laws
 from netkf.logs.outcomes import Outcomes, Test, make_outcomes
@@ -150,7 +150,7 @@ def fit_log(
     scenario = load(folder / "scenario.toml", trust=trust)
     table, notes = read_outcomes(scenario)
     outcomes = make_outcomes(table)
-    distance = _distances(scenario, outcomes)
+    distance = _distances(scenario, outcomes, table)
     tests, share, time, edges = run_tests(outcomes, distance)
     level = (1.0 - confidence) / max(sum(np.isfinite(t.p) for t in tests.values()), 1)
     test_table = _test_table(tests, level)
@@ -168,7 +168,14 @@ def fit_log(
         cov = np.diag([variance * shrink, share.error**2])
         laws.append(Law("shared", np.array([delivery, part]), likelihood, cov=cov))
     laws += _varying_laws(outcomes, edges, tests, shrink, scenario.horizon)
-    law_table = _law_table(laws, rejected, len(table))
+    needs = dict(NEEDS)
+    if scenario.positions.moving:
+        # What follows from places that change shows as bursts, changes and shared fate.
+        needs["distance"] = ("distance", "channel")
+        told = "assumes nothing of time and hearers that is tested"
+        told = told if distance is not None else "is not fitted: places follow the state"
+        notes.append(f"nodes move: the law of the distance {told}")
+    law_table = _law_table(laws, rejected, len(table), needs)
     if np.isfinite(share.value):
         notes.append(
             f"shared fate of hearers: {share.value:.3f} +- {share.error:.3f}; {share.lasting:.3f} "
@@ -262,7 +269,7 @@ def _complete_replay(
 
 
 def run_tests(
-    outcomes: Outcomes, distance: FloatArray | None
+    outcomes: Outcomes, distance: Distances | None
 ) -> tuple[dict[str, Test], stats.Share, float, FloatArray]:
     """Return a test of each assumption, the shared fate, the correlation time in packets, and the
     edges of windows of time in which quality hardly changes.
@@ -293,8 +300,8 @@ def run_tests(
         found["channel"] = stats.test_identical(name, flat, own, spreads, len(counts))
     found |= _direction_test(outcomes, counts, slack)
     if distance is not None and len(counts) > 2:
-        values, _ = stats.fit_distance(distance, counts[:, 0], counts[:, 1], slack)
-        curve = expit((values[0] - distance) / values[1])
+        values, _ = stats.fit_distance(*distance[:3], slack)
+        curve = distance.mean_by_link(expit((values[0] - distance.value) / values[1]))
         found["distance"] = stats.test_identical(ASSUMPTIONS["distance"], counts, curve, spread, 2)
     return found, share, time, edges
 
@@ -336,13 +343,45 @@ def _test_table(tests: Mapping[str, Test], level: float) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=columns)
 
 
-def _distances(scenario: Scenario, outcomes: Outcomes) -> FloatArray | None:
-    """Return the distances (L,) of the ends of links; None if nodes move or are nowhere."""
-    points = scenario.topology.positions
-    if scenario.positions.moving or points is None:
+class Distances(NamedTuple):
+    """Distances ``value`` (M,) at which so many ``packets`` (M,) were sent, of which ``heard`` (M,)
+    arrived, on the ``link`` (M,) of that number: a row for each link where nodes stand still, for
+    each outcome where they move.
+    """
+
+    value: FloatArray
+    packets: FloatArray
+    heard: FloatArray
+    link: IntArray
+
+    def mean_by_link(self, values: FloatArray) -> FloatArray:
+        """Return the mean (L,) over the packets of each link."""
+        total = np.bincount(self.link, self.packets)
+        return np.asarray(np.bincount(self.link, self.packets * values) / np.maximum(total, 1.0))
+
+
+def _distances(scenario: Scenario, outcomes: Outcomes, table: pd.DataFrame) -> Distances | None:
+    """Return the distances of the ends of links; None if nodes are nowhere, where their state says,
+    or move while the ``table`` does not say when.
+    """
+    places, nodes = scenario.positions, {str(node): node for node in scenario.nodes}
+    if places.of_state or not all(places.has(node) for node in nodes.values()):
         return None
-    at = {str(node): np.array(point) for node, point in points.items()}
-    return np.array([np.hypot(*(at[i] - at[j])) for i, j in outcomes.links])
+    ends = [(nodes[i], nodes[j]) for i, j in outcomes.links]
+    if not places.moving:
+        value, (packets, heard) = np.array([places.distance(e) for e in ends]), outcomes.counts.T
+        return Distances(value, packets.astype(float), heard.astype(float), np.arange(len(ends)))
+    if (table["t"] == table["message"]).all():
+        return None
+    rows = [
+        (places.distance(ends[link], t), 1.0, x, link)
+        for group in outcomes.groups
+        for t, own in zip(group.t.tolist(), group.x, strict=True)
+        for link, x in zip(group.links.tolist(), own.tolist(), strict=True)
+        if math.isfinite(x)
+    ]
+    value, packets, heard, link = np.array(rows).T
+    return Distances(value, packets, heard, link.astype(int))
 
 
 def _link_table(
@@ -350,7 +389,7 @@ def _link_table(
     table: pd.DataFrame,
     level: float,
     shrink: float,
-    distance: FloatArray | None,
+    distance: Distances | None,
 ) -> pd.DataFrame:
     """Return a row for each link; intervals hold together with probability 1 - ``level``."""
     count, heard = outcomes.counts.T.astype(float)
@@ -375,14 +414,14 @@ def _link_table(
     with np.errstate(divide="ignore"):
         rows["mean_burst"] = 1.0 / rows["to_good"]
     if distance is not None:
-        rows["distance"] = distance
+        rows["distance"] = distance.mean_by_link(distance.value)
     return rows
 
 
 def _fit_laws(
     outcomes: Outcomes,
     links: pd.DataFrame,
-    distance: FloatArray | None,
+    distance: Distances | None,
     shrink: float,
     bursty: bool,
 ) -> list[Law]:
@@ -408,8 +447,10 @@ def _fit_laws(
         fit = _likelihood(turns[:, 1], np.maximum(turns[:, 0], 1.0))
         laws.append(Law("per-link-bursts", values, fit, turns))
     if distance is not None and len(count) > 2:
-        values, cov = stats.fit_distance(distance, count, heard, shrink)
-        p = expit((values[0] - distance) / values[1])
+        # What follows from places that change is no correlation in time.
+        moves = len(distance.value) > len(count)
+        values, cov = stats.fit_distance(*distance[:3], 1.0 if moves else shrink)
+        p, count, heard = expit((values[0] - distance.value) / values[1]), *distance[1:3]
         fit = float((xlogy(heard, p) + xlog1py(count - heard, -p)).sum())
         if values[1] > 0.0 and values[0] >= 0.0:
             laws.append(Law("distance", values, fit, cov=cov))
@@ -466,10 +507,12 @@ def _likelihood(heard: Any, count: Any) -> float:
     return float(np.sum(xlogy(heard, p) + xlog1py(count - heard, -p)))
 
 
-def _law_table(laws: list[Law], rejected: set[str], count: int) -> pd.DataFrame:
+def _law_table(
+    laws: list[Law], rejected: set[str], count: int, needs: Mapping[str, tuple[str, ...]]
+) -> pd.DataFrame:
     rows = []
     for law in laws:
-        failed = "; ".join(ASSUMPTIONS[key] for key in NEEDS[law.kind] if key in rejected)
+        failed = "; ".join(ASSUMPTIONS[key] for key in needs[law.kind] if key in rejected)
         bic = len(law.values) * math.log(count) - 2.0 * law.likelihood
         rows.append((law.kind, law.describe(), law.likelihood, bic, failed))
     columns = ["law", "parameters", "log_likelihood", "bic", "rejected_by"]

@@ -73,7 +73,7 @@ def read_mercator(log: Path) -> PacketLog:
     sends = sends[["sender", "t", "channel", "to", "sent", "logged"]]
     result = PacketLog(sends, outcomes, origin, 1.0, "lost", notes)
     if places is not None:
-        result.positions = read_positions(places)
+        result.positions = read_positions(places, origin, notes)
     return result
 
 

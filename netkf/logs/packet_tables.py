@@ -103,9 +103,9 @@ def read_tables(log: Path, columns: Mapping[str, str]) -> PacketLog:
     if (table["what"] == "outcome").all() and (table["heard"] == 0.0).any():
         result.absent = "unknown"  # the log says itself what was lost
     if extras["positions"] is not None:
-        result.positions = read_positions(extras["positions"])
+        result.positions = read_positions(extras["positions"], origin, notes)
     if extras["readings"] is not None:
-        result.readings = read_readings(extras["readings"], origin)
+        result.readings = read_readings(extras["readings"], origin, notes)
     return result
 
 
@@ -412,10 +412,12 @@ def _merge_rows(rows: pd.DataFrame, notes: list[str], log: str) -> pd.DataFrame:
     return ordered.drop_duplicates(key)[columns].reset_index(drop=True)
 
 
-def read_positions(path: Path) -> pd.DataFrame:
-    """Return a table node, x, y; raises ScenarioError."""
+def read_positions(path: Path, origin: Decimal, notes: list[str]) -> pd.DataFrame:
+    """Return a table node, x, y, or t (s from ``origin``), node, x, y of nodes that move; raises
+    ScenarioError.
+    """
     raw = read_texts(path)
-    name = find_column(raw, "node") or raw.columns[0]
+    stamp, name = find_column(raw, "t"), find_column(raw, "node") or raw.columns[0]
     columns = {}
     for axis in ("x", "y"):
         column = next((c for c in raw.columns if c in (axis, f"{axis}_m")), "")
@@ -423,10 +425,30 @@ def read_positions(path: Path) -> pd.DataFrame:
             rule = f"must have a column {axis}"
             raise ScenarioError(str(path), rule, list(raw.columns), "name the columns")
         columns[axis] = parse_numbers(path, raw, column)
-    return pd.DataFrame({"node": raw[name].to_numpy(), **columns}).drop_duplicates("node")
+    stamps = parse_stamps(path, raw, stamp) if stamp else [origin] * len(raw)
+    times = [float(s - origin) for s in stamps]
+    table = pd.DataFrame({"t": times, "node": raw[name].to_numpy(), **columns}, index=raw.index)
+    _refuse_two_places(path, table, "one position" + (" at a time" if stamp else ""))
+    kept = table.drop_duplicates(["t", "node"]).sort_values(["t", "node"], kind="stable")
+    if len(kept) < len(table):
+        notes.append(f"merged: {count_phrase(len(table) - len(kept), 'row')} of {path.name}")
+    # The first place of a node that was placed later counts from the beginning.
+    late = (kept["t"] > 0.0) & ~kept.duplicated("node")
+    if late.any():
+        notes.append(f"moved: first places of {count_phrase(int(late.sum()), 'node')} to time 0")
+    kept["t"] = kept["t"].where(~late, 0.0)
+    return kept.reset_index(drop=True) if stamp else kept.drop(columns="t")
 
 
-def read_readings(path: Path, origin: Decimal, column: str = "") -> pd.DataFrame:
+def _refuse_two_places(path: Path, table: pd.DataFrame, what: str) -> None:
+    for (_, node), rows in table.groupby(["t", "node"]):
+        places = rows.drop_duplicates(["x", "y"])
+        if len(places) > 1:
+            rule = f"lines {places.index[0]} and {places.index[1]}: a node must have {what}"
+            raise ScenarioError(str(path), rule, str(node), "correct one of the two rows")
+
+
+def read_readings(path: Path, origin: Decimal, notes: list[str], column: str = "") -> pd.DataFrame:
     """Return t (s from ``origin``), node, y0 of a ``column`` or the first (ScenarioError)."""
     raw = read_texts(path)
     stamp, node = find_column(raw, "t"), find_column(raw, "node") or find_column(raw, "sender")
@@ -434,8 +456,15 @@ def read_readings(path: Path, origin: Decimal, column: str = "") -> pd.DataFrame
     if not stamp or not node or not rest:
         rule = "must have columns t, node and y0"
         raise ScenarioError(str(path), rule, list(raw.columns), "name the columns")
-    stamps = parse_stamps(path, raw, stamp)
-    values = parse_numbers(path, raw, column or rest[0], gaps=True)
+    stamps, used = parse_stamps(path, raw, stamp), column or rest[0]
+    values = parse_numbers(path, raw, used, gaps=True)
     table = pd.DataFrame({"t": [float(s - origin) for s in stamps], "node": raw[node].to_numpy()})
     table["y0"] = values
-    return table[table["y0"].notna() & (table["t"] >= 0.0)].reset_index(drop=True)
+    unused = [name for name in rest if name != used]
+    if unused:
+        notes.append(f"not used: {path.name}: columns {', '.join(unused)}, but {used} as y0")
+    is_empty, is_early = table["y0"].isna(), table["t"] < 0.0
+    for dropped, why in ((is_empty, "without a value"), (is_early & ~is_empty, "before time 0")):
+        if dropped.any():
+            notes.append(f"dropped: {count_phrase(int(dropped.sum()), 'reading')} {why}")
+    return table[~(is_empty | is_early)].reset_index(drop=True)

@@ -240,11 +240,12 @@ def _own_scenario(
     network += f"channel = {toml_text(channel)}\n"
     if len(log.positions):
         placed = log.positions[log.positions["node"].isin(nodes)]
-        if len(placed) == len(nodes):
+        found = placed["node"].nunique()
+        if found == len(nodes):
             files["positions.csv"] = placed.to_csv(index=False)
             network += 'positions = "positions.csv"\n'
         else:
-            log.notes.append(f"dropped: positions, of {len(placed)} of {len(nodes)} nodes only")
+            log.notes.append(f"dropped: positions, of {found} of {len(nodes)} nodes only")
     files["scenario.toml"] = HEAD.format(**keys, told=told) + plant + network + FILTER
     return files
 

@@ -46,7 +46,7 @@ def read_ulb(log: Path) -> PacketLog:
     read_stamps = parse_stamps(paths["readings"], texts, find_column(texts, "t"))
     first = min(*stamps, *read_stamps)
     origin = Decimal(int(first // 60) * 60)  # minutes stay those of the stamps
-    readings = read_readings(paths["readings"], origin)
+    readings = read_readings(paths["readings"], origin, notes)
     lqi = find_column(raw, "rssi")
     reports = pd.DataFrame(
         {
@@ -81,7 +81,7 @@ def read_ulb(log: Path) -> PacketLog:
     result.readings = readings
     places = find_extra(log, "positions")
     if places is not None:
-        result.positions = read_positions(places)
+        result.positions = read_positions(places, origin, notes)
     return result
 
 

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pandas as pd
 import pytest
+import scipy.optimize
 
 import netkf
 from netkf.cli.main import main
@@ -180,6 +181,38 @@ def test_the_logistic_function_of_the_distance():
         values, cov = fit_distance(d, n, heard, 1.0)
         inside.append(np.abs(values - [25.0, 6.0]) < 1.96 * np.sqrt(np.diag(cov)))
     assert (np.mean(inside, axis=0) > binomial_range(200, 0.95)[0]).all()
+
+
+def test_the_distance_when_nodes_move(tmp_path):
+    """One likelihood over all packets, each at the distance at which it was sent: scipy's is the
+    same, and what places cause is taken for neither bursts nor slow changes.
+    """
+    random, rows, places, near = np.random.default_rng(3), [], [], []
+    for k in range(120):
+        at = np.array([[0.0, 0.0], [30.0 + 0.2 * k, 0.0], [0.0, 40.0 - 0.3 * k]])
+        places += [f"{10 * k + 5},{'abc'[i]},{x},{y}" for i, (x, y) in enumerate(at)]
+        for i, j in ((i, j) for i in range(3) for j in range(3) if i != j):
+            d = np.hypot(*(at[i] - at[j]))
+            heard = random.random() < 1.0 / (1.0 + math.exp((d - 30.0) / 6.0))
+            rows.append(f"{10 * k + 5 + i},{'abc'[i]},{'abc'[j]},{k},{int(heard)}")
+            near.append((d, heard))
+    (tmp_path / "packets.csv").write_text("\n".join(["t,from,to,number,heard", *rows]))
+    (tmp_path / "positions.csv").write_text("\n".join(["t,node,x,y", *places]))
+    netkf.import_log(tmp_path, "csv", tmp_path / "log")
+    fit = netkf.fit_log(tmp_path / "log", runs=0)
+    d, heard = np.array(near).T
+
+    def miss(values):
+        z = (values[0] - d) / values[1]
+        return np.logaddexp(0.0, -z)[heard == 1].sum() + np.logaddexp(0.0, z)[heard == 0].sum()
+
+    best = scipy.optimize.minimize(miss, [20.0, 10.0], method="Nelder-Mead", tol=1e-9)
+    law = netkf.load(fit.scenarios["distance"]).network.channel.loss.delivery
+    assert (law.half, law.width) == pytest.approx(best.x, rel=1e-4)
+    row = fit.laws.set_index("law").loc["distance"]
+    assert row["log_likelihood"] == pytest.approx(-best.fun, rel=1e-6)
+    assert row["rejected_by"] == ""
+    assert row["bic"] == fit.laws["bic"].min()
 
 
 def test_runs_draw_parameters_from_their_posterior():

@@ -368,6 +368,29 @@ def test_a_log_counts_a_cause_once(cause, tmp_path):
 SENSORS = [{"nodes": [0], "H": [[1.0, 0.0]], "R": [[0.25]]}]
 
 
+def test_places_and_readings_beside_a_log_are_taken_whole_or_counted(tmp_path):
+    rows = ["t,sender,receiver,number", *(f"{k},{k % 2},{1 - k % 2},{k}" for k in range(1, 9))]
+    (tmp_path / "packets.csv").write_text("\n".join(rows))
+    places = ["t_ms,id,x,y", "1000,0,0,0", "3000,1,5,5", "4000,0,1,0", "4000,0,1,0"]
+    (tmp_path / "positions.csv").write_text("\n".join(places))
+    (tmp_path / "readings.csv").write_text("t,node,a,b\n-5,0,1,2\n2,0,,2\n3,1,4,5\n")
+    paths, notes = netkf.import_log(tmp_path, "csv", tmp_path / "out")
+    origin = float(notes[0].split()[4])
+    table = pd.read_csv(tmp_path / "out" / "positions.csv").to_numpy().tolist()
+    # The first place of node 1 holds from the beginning.
+    first = max(1.0 - origin, 0.0) if origin >= 1.0 else 0.0
+    assert table == [[first, 0, 0, 0], [0.0, 1, 5, 5], [4.0 - origin, 0, 1, 0]]
+    assert netkf.load(paths[0]).positions.moving
+    text = "\n".join(notes)
+    assert "merged: 1 row of positions.csv" in text
+    assert "dropped: 1 reading without a value" in text
+    assert "dropped: 1 reading before time 0" in text
+    assert "not used: readings.csv: columns b, but a as y0" in text
+    (tmp_path / "positions.csv").write_text("\n".join([*places, "4000,0,2,0"]))
+    with pytest.raises(ScenarioError, match="lines 4 and 6: a node must have one position at a t"):
+        netkf.import_log(tmp_path, "csv", tmp_path / "two")
+
+
 def test_a_log_may_take_the_plant_of_a_scenario(tmp_path):
     log, _ = made(tmp_path, 50)
     changes = {"network.graph": {"kind": "complete", "nodes": 3}, "sensors": SENSORS}
