@@ -449,12 +449,10 @@ def _require_laws(scenario: Scenario) -> None:
     for assumption, evidence in scenario.departures:
         if assumption in (RIGHT_CLOCKS, HEALTHY, ALL_READ):
             raise TheoryError(f"{evidence}, so nothing is promised; {CONSISTENCY}")
-    pooled = scenario.node_filter.timing.pooled
-    if scenario.network.lives and (
-        pooled or not (scenario.is_linear and has_columns(scenario) and scenario.views is None)
+    if scenario.network.lives and not (
+        scenario.is_linear and has_columns(scenario) and scenario.views is None
     ):
         rule = "promises survive it of filters whose verbs are affine kernels of one linear state"
-        rule += " and that are in a node" * pooled
         raise TheoryError(f"{LIVES}: {rule}; {CONSISTENCY}")
     if not nodes_with_law(scenario).any():
         raise TheoryError(

@@ -144,9 +144,6 @@ def _require_known_errors(scenario: Scenario, run: Run) -> None:
     if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
         raise TheoryError("the run is of another scenario: its nodes or its state differ")
     require_linear(scenario, accepted=(RIGHT_CLOCKS, ALL_READ))
-    if scenario.network.lives and scenario.node_filter.timing.pooled:
-        rule = "exact errors of one filter of all readings count those of every node"
-        raise TheoryError(f"{LIVES}: {rule}; {CONSISTENCY}")
     in_python = takes_columns(scenario.node_filter) or not has_columns(scenario)
     reasons = [evidence for _, evidence in scenario.departures]
     if scenario.network.lives and (scenario.slotted or scenario.forgetful_nodes):

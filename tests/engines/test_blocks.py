@@ -124,6 +124,19 @@ def test_recorded_pairs_under_clocks(tmp_path: Path, estimates: str) -> None:
     assert_agree(load(text, tmp_path, filter__estimates=estimates))
 
 
+RADIO = {"network__radio": {"bits_per_second": 600.0, "queue": "wait"}}
+
+
+@pytest.mark.parametrize("text", [POSES, CLOCKED])
+def test_radios_and_lives(tmp_path: Path, text: str) -> None:
+    """A message takes as long as the states of its sender, and who was down begins with its own."""
+    lives = {"kind": "duty", "nodes": [2, 3], "period": 4.0, "up": 2.5, "memory": "lost"}
+    filtering = {"kind": "block-intersection", "estimates": "own"}
+    scenario = load(text, tmp_path, filter=filtering, network__lives=[lives], **RADIO)
+    run = assert_agree(scenario)
+    assert "restart" in set(run.events["kind"])
+
+
 KEPT = "block-cross-covariances"
 
 

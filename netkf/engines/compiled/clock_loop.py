@@ -288,8 +288,8 @@ def on_sample(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, 
     instants, instant = state.instants, state.instant_at
     h, last_node = instants.index[instant], -1
     for s in range(instants.first[instant], instants.first[instant + 1]):
-        # A pooled filter reads several nodes at an instant: one row for each.
-        if instants.node[s] != last_node:
+        # A pooled filter reads several nodes at an instant: one row for each that is up.
+        if instants.node[s] >= 0 and instants.node[s] != last_node:
             last_node = instants.node[s]
             record_event(state, now, SENSE, last_node, -1, -1)
     if verbs.linearise != NOTHING:

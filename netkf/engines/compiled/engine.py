@@ -76,8 +76,6 @@ class CompiledEngine(Engine):
         network, rule = scenario.network, ""
         if network.quantise:
             rule = "messages of few bits"
-        elif network.lives and scenario.node_filter.timing.pooled:
-            rule = "nodes that are down at times, with a filter that reads all sensors"
         elif (ungated := ungated_readings(scenario)) is not None:
             rule = f"a gate on {ungated}"
         if rule:

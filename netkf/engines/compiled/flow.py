@@ -30,7 +30,7 @@ from netkf.engines.compiled.events import (
     WANT_TICKS,
 )
 from netkf.engines.compiled.lane_series import series_of_lanes
-from netkf.engines.compiled.life_tables import life_table
+from netkf.engines.compiled.life_tables import life_table, silence
 from netkf.engines.compiled.pair_exchange import pair_exchange
 from netkf.engines.compiled.sample_tables import samples_of
 from netkf.engines.compiled.samples import by_node, entries_of, record_samples
@@ -122,6 +122,8 @@ class Source:
             x = states.local_states(sampled) if is_driven else states.states(sampled)[0]
             samples.read(x, sampled, -math.inf, math.inf)
         self.lives = life_table(scenario, streams)
+        if scenario.network.lives and scenario.node_filter.timing.pooled:
+            silence(samples.instants, self.lives, scenario.topology.index)
         index = scenario.topology.index
         self.clocks = {index[i]: c for i, c in node_times(scenario, streams).items()}
         known = {"instants": samples.instants, "truth": self.states, "lives": self.lives}
@@ -223,7 +225,8 @@ class Workspace:
             )
         scratch, flow_arrays = self._scratch
         nodes = start.nodes.copy()
-        nodes["down"] = draws.lives.down
+        if not self._scenario.node_filter.timing.pooled:
+            nodes["down"] = draws.lives.down
         for place, clock in draws.clocks.items():
             nodes["offset"][place], nodes["pace"][place] = clock.offset, clock.pace
         n = start.xhat.shape[1]
@@ -397,7 +400,8 @@ class FlowRun:
             state.row += 1
         else:
             state.counts[kind] += 1
-        state.nodes["down"][h] ^= 1
+        if not self._scenario.node_filter.timing.pooled:
+            state.nodes["down"][h] ^= 1
         if lives.restarts[k]:
             assert self._clocked is not None
             self._clocked.restart(h, self._scenario.prior_shift(node, time))

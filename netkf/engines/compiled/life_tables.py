@@ -9,6 +9,7 @@ import numpy as np
 
 from netkf.engines.compiled.moving_links import MovingLinks
 from netkf.engines.compiled.senders import Senders
+from netkf.engines.compiled.state import Instants
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.network.lives import lifetimes
 from netkf.rng.streams import Streams
@@ -59,8 +60,10 @@ def life_table(scenario: Scenario, streams: Streams) -> LifeTable:
     if not scenario.network.lives:
         return NO_LIVES
     index, lives = scenario.topology.index, lifetimes(scenario, streams)
+    # A filter that reads all sensors is in no node.
+    pooled = scenario.node_filter.timing.pooled
     rows = sorted(
-        (change.time, index[node], CODES[change.kind], change.up and life.forgets)
+        (change.time, index[node], CODES[change.kind], change.up and life.forgets and not pooled)
         for node, life in lives.items()
         for change in life.changes
     )
@@ -69,6 +72,21 @@ def life_table(scenario: Scenario, streams: Streams) -> LifeTable:
     down[[index[i] for i, life in lives.items() if not life.up]] = 1
     node, kind = (np.array(column, dtype=np.int64) for column in (nodes, kinds))
     return LifeTable(np.array(t, dtype=float), node, kind, np.array(restarts, dtype=bool), down)
+
+
+def silence(instants: Instants, lives: LifeTable, index: dict[int, int]) -> None:
+    """Take away the samples of nodes that are down, of a filter that reads all sensors: they are of
+    no node, and of a sensor without rows; those of a whole instant become some of the one before.
+    """
+    times = np.repeat(instants.t, np.diff(instants.first))
+    nodes = np.array([index[node] for node in instants.node.tolist()], dtype=np.int64)
+    down = lives.is_down(nodes, times)
+    instants.node[down], instants.sensor[down] = -1, len(instants.rows)
+    instants.rows = np.append(instants.rows, 0)
+    instants.root = np.concatenate([instants.root, np.zeros((1, *instants.root.shape[1:]))])
+    kept = np.logical_or.reduceat(~down, instants.first[:-1]) if len(down) else np.zeros(0, bool)
+    instants.t, instants.index = instants.t[kept], instants.index[kept]
+    instants.first = np.append(instants.first[:-1][kept], instants.first[-1])
 
 
 def links_of_lives(

@@ -155,9 +155,7 @@ class SlotFilters:
             self.shift_lane(h, slice(None), moved)
 
     def shift_lane(self, h: int, lane: Any, offset: FloatArray) -> None:
-        """Add ``offset`` (n,) to the estimate, of n or more states, of filter ``h`` in a lane of the
-        first block.
-        """
+        """Add ``offset`` (n,) to the first states of filter ``h`` in a lane of the first block."""
         self._run.offset[:] = 0.0
         self._run.offset[: len(offset), lane] = offset.reshape(-1, *([1] * isinstance(lane, slice)))
         call_kernel(self.kernels.shift, self.records.struct, h, run=self._run)

@@ -597,10 +597,14 @@ class SlotRuns:
         for r, tables in enumerate(self._tables):
             down = absent(setup, tables.lives, times)
             b, lane = divmod(r, LANES)
-            y[b, ..., lane][down] = H[b, ..., lane][down] = 0.0
-            for s in setup.nonlinear_sensors:
-                rows = y[b, :, s.estimator, s.row : s.row + s.rows, lane]
-                rows[down[:, s.estimator]] = np.nan
+            for s in setup.assigned:
+                gone = down[:, self._scenario.topology.index[s.node]]
+                rows = slice(s.row, s.row + s.rows)
+                # What is not linear is read at estimates, unless there is no value.
+                y[b, :, s.estimator, rows, lane][gone] = (
+                    np.nan if s in setup.nonlinear_sensors else 0.0
+                )
+                H[b, :, s.estimator, rows, :, lane][gone] = 0.0
 
     def _read_in_python(
         self, times: SlotTimes, x: FloatArray, y: FloatArray, H: FloatArray

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from netkf.engines.compiled.life_tables import life_table
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.network.node_clocks import node_times
 from netkf.plants.transitions import Transitions
@@ -22,7 +23,7 @@ from netkf.theory.common.columns import LoggedColumns
 from netkf.theory.common.forms import MEAN, Forms
 from netkf.theory.common.increments import IncrementFlows, increment_flows
 from netkf.theory.common.linear_verbs import LinearVerbs
-from netkf.theory.common.observations import Observation, timed_observations
+from netkf.theory.common.observations import Observation, everyone, timed_observations
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
@@ -64,7 +65,14 @@ class ClockColumns(LoggedColumns):
         first = forms.inputs(plant.start_root.shape[1])
         forms.table[self._x, MEAN] = plant.start_mean
         forms.table[self._x, first : forms.used] = plant.start_root
-        self._samples = timed_observations(scenario, Streams(run.seed, run.replica))
+        streams, index = Streams(run.seed, run.replica), scenario.topology.index
+        lives = life_table(scenario, streams)
+
+        def is_up(node: int, time: float) -> bool:
+            return not lives.is_down(index[node], time)
+
+        up = is_up if scenario.network.lives else everyone
+        self._samples = timed_observations(scenario, streams, is_up=up)
         rows = max((len(o.H) for s in self._samples.values() for o in s.values()), default=0)
         self._delivered = _delivered(self._log)
         self._filters = LinearVerbs(
@@ -91,7 +99,6 @@ class ClockColumns(LoggedColumns):
         self._checked, self._unit = 0.0, 1.0 / rate if movable else np.inf
         self._changes = plant.changes[plant.changes < scenario.horizon].tolist()
         self._begin_piece(0)
-        index = scenario.topology.index
         self._index = index
         clock = cast(Any, scenario.network.activation)
         broadcasts = clock is not None and clock.at in ("nodes", "readings")

@@ -101,17 +101,25 @@ def _are_the_same(some: list[Observation], others: list[Observation]) -> bool:
     )
 
 
+def everyone(_node: int, _when: Any) -> bool:
+    """Return True: nodes are never down."""
+    return True
+
+
 def slot_observations(
-    scenario: Scenario, run: Run, join: Callable[..., Any] = stack_observations
+    scenario: Scenario,
+    run: Run,
+    join: Callable[..., Any] = stack_observations,
+    is_up: Callable[[int, int], bool] = everyone,
 ) -> Callable[[int], dict[int, Any]]:
     """Return a function from an increasing slot to its readings by estimator, as ``join`` makes
-    them.
+    them, of nodes that ``is_up(id, slot)``.
     """
     streams, n = Streams(run.seed, run.replica), scenario.plant.n
     noises = _noises(scenario)
     estimators = [
         [
-            (sensor, scenario.slot_path(streams, node, sensor))
+            (node, sensor, scenario.slot_path(streams, node, sensor))
             for node in nodes
             for sensor in scenario.placed_sensors.get(node, ())
         ]
@@ -126,12 +134,12 @@ def slot_observations(
         for estimator, paths in enumerate(estimators):
             if not paths:
                 continue
-            rows = [(sensor, path, path.matrix(slot)) for sensor, path in paths]
+            rows = [(node, sensor, path, path.matrix(slot)) for node, sensor, path in paths]
             # A sensor without a reading in this slot has a matrix without rows.
             readings = [
                 Observation(H, *_noise(path, slot, noises[sensor.entry]))
-                for sensor, path, H in rows
-                if len(H)
+                for node, sensor, path, H in rows
+                if len(H) and is_up(node, slot)
             ]
             # Sensors that do not vary have the same matrices in all slots, stacked once.
             known = stacked.get(estimator)
@@ -144,9 +152,14 @@ def slot_observations(
 
 
 def timed_observations(
-    scenario: Scenario, streams: Streams, join: Callable[..., Any] = stack_observations
+    scenario: Scenario,
+    streams: Streams,
+    join: Callable[..., Any] = stack_observations,
+    is_up: Callable[[int, float], bool] = everyone,
 ) -> dict[float, dict[int, Any]]:
-    """Return sampled readings by time (s) and estimator, as ``join`` makes them."""
+    """Return sampled readings by time (s) and estimator, as ``join`` makes them, of nodes that
+    ``is_up(id, time)``.
+    """
     n, by_node, noises = scenario.plant.n, scenario.sampled_sensors, _noises(scenario)
     times = sample_times(scenario, streams)
     fixed = [
@@ -168,8 +181,8 @@ def timed_observations(
                     if path is not None:
                         H = path.reading(k, np.zeros(n))[1]
                         reading = Observation(H, *_noise(path, k, noises[placed_sensor.entry]))
-                    at_time = observations.setdefault(time, {})
-                    at_time.setdefault(estimator, []).append(reading)
+                    at_time = observations.setdefault(time, {}).setdefault(estimator, [])
+                    at_time += [reading] * is_up(node, time)
     return {
         time: {estimator: join(readings, n) for estimator, readings in at_time.items()}
         for time, at_time in observations.items()

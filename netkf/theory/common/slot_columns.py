@@ -58,8 +58,9 @@ class SlotColumns(ErrorColumns):
         self._kernels = replace(kernels, decides=False)
         super().__init__()
         self._fewest = 0
-        self._all_observations = slot_observations(scenario, run)
+        self._observe = slot_observations(scenario, run, is_up=self._is_up)
         self._lives = life_table(scenario, Streams(run.seed, run.replica))
+        self._absent: tuple[int, np.ndarray] = (-1, np.zeros(0, dtype=bool))
         self._restarts = slot_restarts(scenario, self._lives)
         # The origin follows the true state, so that errors on unstable plants keep their digits,
         # but not the mean with which a node begins again.
@@ -68,13 +69,13 @@ class SlotColumns(ErrorColumns):
         self._x = np.column_stack([np.zeros(self.n), plant.start_mean, plant.start_root])
         self._filters = self._begin()
 
-    def _observe(self, slot: int) -> dict[int, Observation]:
-        observations = self._all_observations(slot)
-        if not len(self._lives.t) and not self._lives.down.any():
-            return observations
-        times = step_times(self._scenario, self._setup, slot, 1)
-        down = absent(self._setup, self._lives, times)[0]
-        return {h: one for h, one in observations.items() if not down[h]}
+    def _is_up(self, node: int, slot: int) -> bool:
+        if not self._scenario.network.lives:
+            return True
+        if self._absent[0] != slot:
+            times = step_times(self._scenario, self._setup, slot, 1)
+            self._absent = slot, absent(self._setup, self._lives, times)[0]
+        return not self._absent[1][self._scenario.topology.index[node]]
 
     def _begin(self) -> SlotFilters:
         setup = self._setup
