@@ -53,7 +53,7 @@ def stacked_sensors(
 def support_of(sensor: Any, n: int) -> np.ndarray:
     """Return the entries (k,) of a state of ``n`` that readings of a sensor depend on."""
     if not sensor.linear:
-        anchors = sensor.record.anchors if sensor.record is not None else sensor.nodes
+        anchors = (sensor.record.anchors if sensor.record is not None else ()) or sensor.nodes
         return np.unique(np.concatenate([sensor.support(n, one) for one in anchors]))
     matrices = [*getattr(sensor, "_pairs", {}).values()]
     if not matrices and not hasattr(sensor, "C"):

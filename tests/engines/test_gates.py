@@ -11,6 +11,7 @@ import netkf
 from netkf.algorithms.gates import Gate
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.trace.schema import CODES
+from tests.algorithms.test_block_intersection import ROBOTS, load
 from tests.conftest import SCENARIOS
 from tests.engines.agreement import assert_agree
 from tests.engines.test_batches import assert_alone
@@ -342,18 +343,31 @@ def test_gains_stay_with_their_rows(scenario_of, tmp_path, engine):
     assert len(set(refusals)) < len(refusals) < 2 * horizon - 10
 
 
+TRIGGERED = {"kind": "event-triggered", "trigger": "stochastic", "Y": 0.5, "inner": {"kind": "icf"}}
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
         ({"filter": {"kind": "intermittent"}}, "readings that messages bring"),
+        ({"filter": TRIGGERED}, "readings that a trigger weighs with the noise they had"),
         ({"filter.linearise": "ukf"}, "nonlinear readings at sigma points"),
     ],
 )
 def test_what_the_compiled_engine_leaves_to_simpy(changes, words):
     file = {"filter": "intermittent_scalar.toml"}.get(next(iter(changes)))
     scenario = netkf.load(SCENARIOS / (file or "nonlinear/range_tracking.toml"))
-    gate = {"probability": 0.9}
+    gate = {"probability": 0.9, "then": "inflate"}
     scenario = scenario.replace({**changes, "horizon": 2.0}).replace({"filter.gate": gate})
     with pytest.raises(netkf.EngineError, match=f"cannot run a gate on {words}; use engine="):
         netkf.simulate(scenario, engine="compiled")
     assert netkf.simulate(scenario).engine == "simpy"
+
+
+def test_readings_of_pairs_in_messages_pass(tmp_path):
+    """Nodes estimate blocks of their own, so that their H has other columns than the receiver's."""
+    scenario = load(ROBOTS, tmp_path).replace({"filter.kind": "block-intersection", "horizon": 4.0})
+    gated = scenario.replace({"filter.gate": {"probability": 0.999999999999}})
+    run, other = (netkf.simulate(one, engine="simpy") for one in (scenario, gated))
+    assert run.fingerprint == other.fingerprint
+    np.testing.assert_array_equal(run.xhat, other.xhat)

@@ -391,3 +391,21 @@ def test_the_map_has_nodes_where_they_are(tmp_path):
     del table["network"]["positions"]
     places = get_positions(from_table(table, tmp_path))
     assert math.dist(places[1], places[2]) == pytest.approx(2.0)
+
+
+def test_recorded_readings_of_own_places_need_no_anchors(tmp_path):
+    """Without a column ``to`` a node that estimates its own block reads where its sensor stands."""
+    drive = {"kind": "constant", "value": [0.5, 0.2]}
+    table = team(tmp_path, input=drive)
+    rows = "t,node,y0,y1\n0.5,1,2.9,-2.1\n1.0,1,3.1,-2.3\n1.5,1,3.6,-2.6\n"
+    (tmp_path / "seen.csv").write_text(rows)
+    (tmp_path / "anchored.csv").write_text(rows.replace("y0", "to,y0").replace(",1,", ",1,7,"))
+    table |= {"network": {"graph": table["network"]["graph"]}, "sensors": table["sensors"][:1]}
+    table["filter"] = {"kind": "local", "estimates": "own"}
+    runs = []
+    for path in ("seen.csv", "anchored.csv"):
+        table["sensors"][0]["path"] = path
+        runs.append(netkf.simulate(from_table(table, tmp_path), engine="simpy"))
+    np.testing.assert_array_equal(runs[0].xhat, runs[1].xhat)
+    start = from_table({**table, "sensors": []}, tmp_path)
+    assert np.nanmax(np.abs(netkf.simulate(start, engine="simpy").xhat - runs[0].xhat)) > 0.05

@@ -24,6 +24,8 @@ def ungated_readings(scenario: Scenario) -> str | None:
         return None
     if algorithm.timing.talks and kernels is not None and kernels.sends_readings:
         return "readings that messages bring"
+    if scenario.filter.gate.then == "inflate" and algorithm.timing.randomised:
+        return "readings that a trigger weighs with the noise they had"
     if not scenario.has_linear_sensors and scenario.views is not None:
         return "nonlinear readings of nodes that estimate different states"
     if not scenario.has_linear_sensors and scenario.filter.linearise != "ekf":

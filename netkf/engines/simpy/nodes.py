@@ -250,11 +250,12 @@ class Node:
 
     def _gated_payload(self, message: Message, time: float, recorder: Recorder) -> Any:
         """Return a payload with its reading as the gate lets it pass. Estimates pass, because their
-        errors are correlated in an unknown way with those of the node, and readings of the past.
+        errors are correlated in an unknown way with those of the node, and readings of the past
+        and of pairs of blocks.
         """
         payload, reading = message.payload, getattr(message.payload, "reading", None)
         whole = isinstance(payload, Payload) and payload.sender.kernels.sends_whole_readings
-        if not whole or reading is None or message.age > 0.0:
+        if not whole or reading is None or message.age > 0.0 or self.algorithm.needs.blocks:
             return payload
         # Whitened: the covariance of its noise is 1.
         sample = reading.y, reading.H, np.eye(len(reading.y))
