@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import netkf
+from netkf.checks.parts.events import loss_law
 from netkf.network.losses import Bernoulli, GilbertElliott, Loss, SharedLoss
 from netkf.trace.schema import CODES
 
@@ -211,6 +212,28 @@ def test_a_shared_chain_is_one_state_for_all_hearers(scenario_of):
         bursts = [len(list(g)) for bad, g in itertools.groupby(series.tolist()) if bad]
         # Geometric bursts of mean 5; their number and spread give the interval.
         assert np.mean(bursts) == pytest.approx(5.0, abs=4.5 * np.sqrt(20.0 / len(bursts)))
+
+
+def test_a_shared_chain_steps_once_a_transmission(scenario_of):
+    """Where a sender tells one neighbour at a time, messages of a link are several steps apart:
+    ``check`` promises nothing of their bursts then.
+    """
+    chain = 'kind = "gilbert-elliott", mean_loss = 0.4, mean_burst = 5.0, shared = true'
+    channel = f"loss = {{ {chain} }}, symmetric = false"
+    text = CLOCKS.replace('"complete", nodes = 5', '"star", nodes = 5')
+    text = text.replace('"poisson", rate = 2.0', '"periodic", period = 1.0')
+    scenario = scenario_of(text, channel, horizon=120.0, at="links")
+    run = netkf.simulate(scenario.replace({"probe": 100.0}), seed=2, engine="simpy")
+    node, peer, number, _, lost = outcomes(run)
+    again = []
+    for other in (1, 2, 3, 4):
+        chosen = (node == 0) & (peer == other)
+        series = lost[chosen][np.argsort(number[chosen])]
+        again += series[1:][series[:-1]].tolist()
+    # A step keeps the state with weight 1 - 1/5 - (1/5) (0.4/0.6); one step alone would give 0.8.
+    assert np.mean(again) == pytest.approx(0.4 + 0.6 * (2.0 / 3.0) ** 4, abs=0.12)
+    assert loss_law(scenario).chain is None
+    assert loss_law(scenario_of(text, channel, at="nodes")).chain is not None
 
 
 def test_the_schedule_is_followed(scenario_of):

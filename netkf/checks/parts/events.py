@@ -163,6 +163,8 @@ def loss_law(scenario: Scenario) -> LossLaw:
     one_step = isinstance(clock, Matching) or (
         isinstance(clock, LinkClock) and (clock.at == "links" or not channel.symmetric)
     )
+    # Nor does a chain that a sender's links share step once between two messages of one of them.
+    one_step &= loss.state_of == "link" or scenario.has_broadcasts
     share = loss.fate_share if scenario.has_broadcasts else 0.0
     return LossLaw(
         lost=1.0 - np.array(delivery),
