@@ -478,10 +478,10 @@ def first_root(cov: FloatArray) -> FloatArray:
 
 
 def first_roots(covariances: Sequence[FloatArray]) -> FloatArray:
-    """Return the roots (N, n, n) of N initial covariances (n, n), many of which are one array."""
-    distinct = {id(cov): cov for cov in covariances}
-    roots = {key: first_root(cov) for key, cov in distinct.items()}
-    return np.stack([roots[id(cov)] for cov in covariances])
+    """Return the roots (N, n, n) of N initial covariances (n, n), many of which are equal."""
+    keys = [cov.tobytes() for cov in covariances]
+    roots = {key: first_root(cov) for key, cov in dict(zip(keys, covariances, strict=True)).items()}
+    return np.stack([roots[key] for key in keys])
 
 
 @kernel

@@ -46,8 +46,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Figures are only written to files. A user's setting of a window system that is missing
         # here would make matplotlib raise ValueError.
         os.environ["MPLBACKEND"] = "agg"
-        # Threads of OpenBLAS that wait for the next product would spin for 30 ms after each.
-        os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "10")
+        # Threads of OpenBLAS spin while they wait for the next product: on a busy machine commands
+        # took up to four times the processor time. Those of a pool of workers have one each, too.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         run_as_process(partial(_run_command, sys.argv[1:]))
     with Interruption() as interruption:
         return _run_command(arguments, interruption)

@@ -79,6 +79,9 @@ ALL_READ = "nodes take all readings that gains and P count"
 """Assumptions of all filters, see ``ScenarioModel.departures``."""
 
 
+NO_RADIO = Radio()
+
+
 @dataclass(frozen=True, eq=False)
 class Network(Component):
     """The graph of a network, the activation of its links and the channel of its messages.
@@ -695,7 +698,7 @@ class ScenarioModel(Component):
     def message_size(self, node: int, phase: int) -> float:
         """Return the bytes of a message of ``node`` (id) in a ``phase`` of a slot, or -1."""
         if (node, phase) not in self._message_sizes:
-            radio, index = self.network.radio or Radio(), self.topology.index[node]
+            radio, index = self.network.radio or NO_RADIO, self.topology.index[node]
             # Some filters send their readings.
             rows = sum(len(self.sensors[p.entry].R) for p in self.placed_sensors.get(node, ()))
             numbers = self.node_filter.analysis.payload_numbers(int(self.sizes[index]), rows, phase)
@@ -708,7 +711,7 @@ class ScenarioModel(Component):
     def _message_sizes(self) -> dict[tuple[int, int], float]:
         return {}
 
-    @property
+    @cached_property
     def has_broadcasts(self) -> bool:
         """True if a transmission has several hearers: of nodes, but not of links or pairs."""
         if self.slotted:

@@ -445,11 +445,11 @@ def demand_probabilities(loss: Loss, channels: ChannelStreams, directions: Seque
 
 def delivery_table(scenario: Scenario, loss: Loss, directions: Sequence[Link]) -> FloatArray:
     """Return the delivery probabilities (2, W) of each direction in a good and a bad state."""
+    # By exact type: a subclass may override the law.
+    is_common = type(loss) in (NoLoss, Bernoulli)
+    first = [scenario.transmission(w) for w in (directions[:1] if is_common else directions)]
     table = [
-        [
-            float(loss.delivery_probability(scenario.transmission(direction)._replace(bad=bad)))
-            for direction in directions
-        ]
+        [float(loss.delivery_probability(sent._replace(bad=bad))) for sent in first]
         for bad in (False, True)
     ]
-    return np.array(table)
+    return np.array(np.broadcast_to(np.array(table), (2, len(directions))))
