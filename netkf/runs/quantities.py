@@ -137,15 +137,15 @@ class NetworkSink(Sink):
                 found[-1, :2] = np.nanmean(found[:-1, 0]), np.nanmax(found[:-1, 1])
         self.connectivity.finish()
         found[:, 2] = self.connectivity.shares()
-        radio, energy = scenario.network.radio or Radio(), scenario.network.energy
+        radio, energy = scenario.network.radio or Radio(), scenario.network.energy or Energy()
         for k, node in enumerate(scenario.nodes):
             found[k, 3:] = 0.0
             for phase, count in self._transmissions.by_phase(node).items():
                 size = scenario.message_size(node, phase)
-                spent = _joules(energy or Energy(), size, radio.frames(size))
+                spent = _joules(energy, size, radio.frames(size))
                 found[k, 3:] += count * np.array([1.0, size, spent])
         found[-1, 3:] = found[:-1, 3:].sum(axis=0)
-        if energy is None:
+        if scenario.network.energy is None:
             found[:, 5] = np.nan
         return found
 

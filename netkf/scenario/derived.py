@@ -244,7 +244,7 @@ class DerivedScenario(ScenarioModel):
         stacked = self._stack_sensors(self._pooled_sensors, believed=True)
         return self._slot_model(*stacked) if self.slotted else self._flow_model(*stacked)
 
-    @property
+    @cached_property
     def model_views(self) -> tuple[np.ndarray, ...] | None:
         """The entries (n',) of the state of which each node has a model; None for all of it."""
         return None if self.node_filter.needs.coupled else self.views
@@ -329,13 +329,14 @@ class DerivedScenario(ScenarioModel):
         sampled = self.placed_sensors if self.slotted else self.sampled_sensors
         counts = Counter(itertools.chain.from_iterable(self.estimated)) if self.plants else None
         whole = self.layout.places if self.node_filter.needs.coupled else ()
+        places = dict(zip(self.nodes, map(self._own_places, range(len(self.nodes))), strict=True))
         return tuple(
             NodeInfo(
                 node, degrees[node], receiver_counts[node], len(self.nodes), own_weights[node],
                 total_information, max_delay, k, tuple(sorted(senders[node])), network, most_rows,
-                self._own_sensors(k, sampled.get(node, ())), self._own_places(k),
+                self._own_sensors(k, sampled.get(node, ())), places[node],
                 self._is_alone(k, counts), whole,
-                tuple(self._own_places(self.topology.index[i]) for i in sorted(senders[node])),
+                tuple(places[i] for i in sorted(senders[node])),
             )
             for k, node in enumerate(self.nodes)
         )  # fmt: skip
