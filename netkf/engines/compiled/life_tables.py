@@ -78,13 +78,15 @@ def silence(instants: Instants, lives: LifeTable, index: dict[int, int]) -> None
     """Take away the samples of nodes that are down, of a filter that reads all sensors: they are of
     no node, and of a sensor without rows; those of a whole instant become some of the one before.
     """
+    if not len(instants.t):
+        return  # all runs share one of these
     times = np.repeat(instants.t, np.diff(instants.first))
     nodes = np.array([index[node] for node in instants.node.tolist()], dtype=np.int64)
     down = lives.is_down(nodes, times)
     instants.node[down], instants.sensor[down] = -1, len(instants.rows)
     instants.rows = np.append(instants.rows, 0)
     instants.root = np.concatenate([instants.root, np.zeros((1, *instants.root.shape[1:]))])
-    kept = np.logical_or.reduceat(~down, instants.first[:-1]) if len(down) else np.zeros(0, bool)
+    kept = np.logical_or.reduceat(~down, instants.first[:-1])
     instants.t, instants.index = instants.t[kept], instants.index[kept]
     instants.first = np.append(instants.first[:-1][kept], instants.first[-1])
 
