@@ -122,7 +122,7 @@ class Source:
             x = states.local_states(sampled) if is_driven else states.states(sampled)[0]
             samples.read(x, sampled, -math.inf, math.inf)
         self.lives = life_table(scenario, streams)
-        if scenario.network.lives and scenario.node_filter.timing.pooled:
+        if not self.lives.in_nodes:
             silence(samples.instants, self.lives, scenario.topology.index)
         index = scenario.topology.index
         self.clocks = {index[i]: c for i, c in node_times(scenario, streams).items()}
@@ -225,8 +225,7 @@ class Workspace:
             )
         scratch, flow_arrays = self._scratch
         nodes = start.nodes.copy()
-        if not self._scenario.node_filter.timing.pooled:
-            nodes["down"] = draws.lives.down
+        nodes["down"] = draws.lives.filters_down
         for place, clock in draws.clocks.items():
             nodes["offset"][place], nodes["pace"][place] = clock.offset, clock.pace
         n = start.xhat.shape[1]
@@ -400,7 +399,7 @@ class FlowRun:
             state.row += 1
         else:
             state.counts[kind] += 1
-        if not self._scenario.node_filter.timing.pooled:
+        if lives.in_nodes:
             state.nodes["down"][h] ^= 1
         if lives.restarts[k]:
             assert self._clocked is not None

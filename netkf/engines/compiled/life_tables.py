@@ -23,6 +23,7 @@ class LifeTable(NamedTuple):
     t, node, kind : (K,), seconds, index of the node, and kind of the event
     restarts : (K,) bool, whether the node goes up and begins again
     down : (N,), 1 for nodes that are down at first; (1,) without lives
+    in_nodes : whether filters are in nodes, and down with them
     """
 
     t: FloatArray
@@ -30,6 +31,12 @@ class LifeTable(NamedTuple):
     kind: IntArray
     restarts: np.ndarray
     down: np.ndarray
+    in_nodes: bool = True
+
+    @property
+    def filters_down(self) -> np.ndarray:
+        """1 for filters that are down at first."""
+        return self.down if self.in_nodes else np.zeros(1, dtype=np.int64)
 
     def passed(self, nodes: Any, times: Any) -> IntArray:
         """Return how many changes of ``nodes`` (indices) came until the ``times``, both of any
@@ -60,10 +67,9 @@ def life_table(scenario: Scenario, streams: Streams) -> LifeTable:
     if not scenario.network.lives:
         return NO_LIVES
     index, lives = scenario.topology.index, lifetimes(scenario, streams)
-    # A filter that reads all sensors is in no node.
-    pooled = scenario.node_filter.timing.pooled
+    in_nodes = not scenario.node_filter.timing.pooled
     rows = sorted(
-        (change.time, index[node], CODES[change.kind], change.up and life.forgets and not pooled)
+        (change.time, index[node], CODES[change.kind], change.up and life.forgets and in_nodes)
         for node, life in lives.items()
         for change in life.changes
     )
@@ -71,7 +77,8 @@ def life_table(scenario: Scenario, streams: Streams) -> LifeTable:
     down = np.zeros(len(index), dtype=np.int64)
     down[[index[i] for i, life in lives.items() if not life.up]] = 1
     node, kind = (np.array(column, dtype=np.int64) for column in (nodes, kinds))
-    return LifeTable(np.array(t, dtype=float), node, kind, np.array(restarts, dtype=bool), down)
+    changes = np.array(t, dtype=float), node, kind, np.array(restarts, dtype=bool)
+    return LifeTable(*changes, down, in_nodes)
 
 
 def silence(instants: Instants, lives: LifeTable, index: dict[int, int]) -> None:

@@ -23,7 +23,7 @@ from netkf.theory.common.columns import LoggedColumns
 from netkf.theory.common.forms import MEAN, Forms
 from netkf.theory.common.increments import IncrementFlows, increment_flows
 from netkf.theory.common.linear_verbs import LinearVerbs
-from netkf.theory.common.observations import Observation, everyone, timed_observations
+from netkf.theory.common.observations import Observation, timed_observations
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
@@ -65,14 +65,9 @@ class ClockColumns(LoggedColumns):
         first = forms.inputs(plant.start_root.shape[1])
         forms.table[self._x, MEAN] = plant.start_mean
         forms.table[self._x, first : forms.used] = plant.start_root
-        streams, index = Streams(run.seed, run.replica), scenario.topology.index
-        lives = life_table(scenario, streams)
-
-        def is_up(node: int, time: float) -> bool:
-            return not lives.is_down(index[node], time)
-
-        up = is_up if scenario.network.lives else everyone
-        self._samples = timed_observations(scenario, streams, is_up=up)
+        streams, self._index = Streams(run.seed, run.replica), scenario.topology.index
+        self._lives = life_table(scenario, streams)
+        self._samples = timed_observations(scenario, streams, is_up=self._is_up)
         rows = max((len(o.H) for s in self._samples.values() for o in s.values()), default=0)
         self._delivered = _delivered(self._log)
         self._filters = LinearVerbs(
@@ -99,7 +94,6 @@ class ClockColumns(LoggedColumns):
         self._checked, self._unit = 0.0, 1.0 / rate if movable else np.inf
         self._changes = plant.changes[plant.changes < scenario.horizon].tolist()
         self._begin_piece(0)
-        self._index = index
         clock = cast(Any, scenario.network.activation)
         broadcasts = clock is not None and clock.at in ("nodes", "readings")
         self._shared = broadcasts and not self._filters.kernels.addressed
@@ -109,6 +103,10 @@ class ClockColumns(LoggedColumns):
             for h in range(len(links.first) - 1)
             for w in range(links.first[h], links.first[h + 1])
         }
+
+    def _is_up(self, node: int, time: float) -> bool:
+        lives = self._scenario.network.lives
+        return not lives or not self._lives.is_down(self._index[node], time)
 
     def _begin_piece(self, piece: int) -> None:
         scenario, plant = self._scenario, cast(Any, self._scenario.plant).pieces[piece]
