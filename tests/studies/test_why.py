@@ -27,6 +27,7 @@ from netkf.studies.information import (
 from netkf.studies.message_sets import Candidate, find_smallest_set
 from netkf.studies.replay import Replayer, delivering
 from netkf.studies.why import why
+from tests.conftest import SCENARIOS
 
 FLOW = {"kind": "diffusion", "A": [[-0.3]], "B": [[1.0]], "cov": [[1.0]]}
 SLOTS = {"kind": "linear", "F": [[0.95]], "Q": [[0.3]], "period": 0.5, "cov": [[1.0]]}
@@ -411,6 +412,13 @@ def test_before_the_first_event_a_node_knows_what_it_began_with(name, runs):
         expected = 1.0 if scenario.slotted else (1.0 - 0.4 * math.exp(-0.6 * at)) / 0.6
         assert found.trace == pytest.approx(expected, rel=1e-9)
         assert all(math.isnan(source.heard) for source in found.sources)
+
+
+def test_links_that_move_are_explained_between_samples_too():
+    scenario = netkf.load(SCENARIOS / "blocks" / "formation.toml", {"horizon": 9.0})
+    run = netkf.simulate(scenario, engine="simpy")
+    for at in (7.3459, 8.77):  # in between a link is seen to have come or gone
+        assert math.isfinite(why(run, 4, at, replays=1).trace)
 
 
 def test_what_cannot_be_answered_is_refused_in_one_line(runs):
