@@ -20,6 +20,7 @@ from netkf.figures.style import (
     draw_legend,
     finish_figure,
     new_figure,
+    plain,
     set_scale,
 )
 from netkf.linalg.arrays import FloatArray
@@ -176,7 +177,7 @@ def _draw_correlations(
         axes.plot(positions, mean, "-o", color=INK, ms=3.5, label="mean of all nodes")
     node, read = worst
     name = ("all readings" if node < 0 else f"node {node}") + f", {read}" * bool(read)
-    label = f"{name}, the largest" if len(curves) > 1 else name
+    label = plain(f"{name}, the largest" if len(curves) > 1 else name, 60)
     axes.plot(positions, curves[node], "--s", color=SENSING, ms=3.5, label=label)
     axes.set(xlabel="lag, readings of the node", ylabel="autocorrelation of innovations")
     axes.xaxis.get_major_locator().set_params(integer=True)

@@ -13,7 +13,7 @@ from matplotlib.ticker import FuncFormatter
 
 from netkf.figures.figure_data import FigureData
 from netkf.figures.layout import Positions, get_positions
-from netkf.figures.style import INK, MUTED, SEQUENTIAL, Picture, finish_figure, new_figure
+from netkf.figures.style import INK, MUTED, SEQUENTIAL, Picture, finish_figure, new_figure, plain
 
 MAX_LINKS = 20_000
 MAX_LABELLED_NODES = 60
@@ -123,7 +123,7 @@ def draw_network(
         for node in data.nodes:
             style: dict[str, Any] = {"fontsize": 6.5, "color": MUTED, "zorder": 3}
             offset: dict[str, Any] = {"xytext": (distance,) * 2, "textcoords": "offset points"}
-            axes.annotate(str(node), positions[node], **offset, **style)
+            axes.annotate(plain(node), positions[node], **offset, **style)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.13)
     axes.axis("off")

@@ -18,13 +18,15 @@ from netkf.figures.style import (
     draw_legend,
     finish_figure,
     new_figure,
+    plain,
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.outcomes import Outcomes, delivery_matrix, fate_matrix, loss_windows, outcomes_of
 
 MAX_NUMBERS = 14
 """Nodes up to which numbers fit into the cells of a matrix."""
-MAX_TICKS = 30
+MAX_TICKS, MAX_LETTERS = 30, 75
+"""Labels of a matrix, and the letters of them all that fit beside each other."""
 WINDOWS, MAX_ROWS = 60, 60
 """Parts of the time, and directions whose rows can still be told apart."""
 
@@ -82,8 +84,9 @@ def _draw_matrix(
     cmap = mpl.colormaps[colours].with_extremes(bad="white")
     image = axes.imshow(values, vmin=span[0], vmax=span[1], cmap=cmap, interpolation="nearest")
     places = select_evenly(np.arange(len(nodes)), MAX_TICKS)
-    names = [str(nodes[k]) for k in places.tolist()]
-    axes.set_xticks(places, names, fontsize=6.5, rotation=90 if len(names) > MAX_NUMBERS else 0)
+    names = [plain(nodes[k]) for k in places.tolist()]
+    is_tight = len(names) > MAX_NUMBERS or len(names) * max(map(len, names)) > MAX_LETTERS
+    axes.set_xticks(places, names, fontsize=6.5, rotation=90 if is_tight else 0)
     axes.set_yticks(places, names, fontsize=6.5)
     axes.tick_params(length=0)
     if len(nodes) <= MAX_NUMBERS:
@@ -122,7 +125,8 @@ def losses_figure(data: FigureData) -> Picture:
     image = lower.pcolormesh(
         edges, np.arange(len(rows) + 1), shares[rows], vmin=0.0, vmax=1.0, cmap=cmap
     )
-    names = [f"{data.nodes[i]} to {data.nodes[j]}" for i, j in (links[k] for k in rows.tolist())]
+    pairs = (map(plain, (data.nodes[k] for k in links[row])) for row in rows.tolist())
+    names = [f"{sender} to {receiver}" for sender, receiver in pairs]
     ticks = select_evenly(np.arange(len(rows)), MAX_TICKS)
     lower.set_yticks(ticks + 0.5, [names[k] for k in ticks.tolist()], fontsize=5.5)
     lower.invert_yaxis()

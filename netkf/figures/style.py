@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import TextToPath
 
-from netkf.core.printable import one_line
+from netkf.core.printable import one_line, shorten
 from netkf.figures.names import SERIES
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.files import write_atomically
@@ -135,6 +135,13 @@ def _split_word(line: str, width: float, size: float, weight: str) -> list[str]:
         pieces.append(line[:count])
         line = line[count:]
     return [*pieces, line]
+
+
+def plain(text: object, most: int = 24) -> str:
+    """Return a name as one line of at most ``most`` characters for an axis or a legend, where
+    matplotlib takes dollar signs for formulas.
+    """
+    return shorten(text, most).replace("$", r"\$")
 
 
 @lru_cache(maxsize=4096)

@@ -26,6 +26,7 @@ from netkf.figures.style import (
     draw_legend,
     finish_figure,
     new_figure,
+    plain,
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.trace.messages import DELIVERED, UNDER_WAY, by_link
@@ -227,7 +228,7 @@ def links_figure(data: FigureData) -> Picture:
     axes.plot([], [], "|", color=INK, label="delivered")
     axes.plot([], [], "x", color=LOST, label="lost")
     named = data.scenario.topology.named
-    labels = [f"{named(one.sender)} to {named(one.receiver)}" for one in selection]
+    labels = [f"{plain(named(one.sender))} to {plain(named(one.receiver))}" for one in selection]
     axes.set_yticks(range(len(selection)), labels, fontsize=6.5)
     axes.set_ylim(-0.8, len(selection) - 0.2)
     axes.invert_yaxis()
@@ -314,8 +315,9 @@ def _draw_shares(
         misses = int(((probabilities < low) | (probabilities > high)).sum())
     axes.set_ylim(-0.02, 1.04)
     if len(directions) <= MAX_LABELLED:
-        names = [f"{d.sender}>{d.receiver}" for d in directions]
-        rotation = 90 if len(directions) > 8 else 0
+        named = data.scenario.topology.named
+        names = [f"{plain(named(d.sender))}>{plain(named(d.receiver))}" for d in directions]
+        rotation = 90 if len(names) * max(map(len, names)) > 24 else 0
         axes.set_xticks(positions, names, fontsize=6.5, rotation=rotation)
         axes.set_xlabel("direction, sender > receiver")
     else:

@@ -17,6 +17,7 @@ from netkf.report.innovations import describe_innovations
 from netkf.report.messages import information_age
 from netkf.report.replicas import describe_replica
 from netkf.report.worst import StartUp, WorstSample, WorstSamples, summary_samples
+from netkf.runs.outcomes import downtimes
 from netkf.runs.stored import StoredRun
 from netkf.runs.summary import CONFIDENCE
 from netkf.runs.tables import format_number, format_with_error
@@ -197,6 +198,11 @@ def _explain_worst(
     sentences = []
     if samples.start is not None:
         sentences.append(_describe_start_up(samples.overall, worst, samples.start))
+    sentences += [
+        f"It was down at {_format_time(worst.time)}, since {_format_time(one.begin)}"
+        for one in downtimes(source.scenario, run.seed, run.replica)
+        if one.node == worst.node and one.begin <= worst.time < one.end
+    ]
     if len(received):
         # Messages that arrived later did not influence the sample.
         cutoff = float(source.cutoffs(np.array([worst.time]))[0])

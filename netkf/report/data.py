@@ -15,6 +15,7 @@ from netkf.report.innovations import innovation_columns
 from netkf.report.messages import ThinnedMessages, bin_messages, information_age, thin_messages
 from netkf.report.packing import Packer
 from netkf.report.worst import WorstSample
+from netkf.runs.outcomes import downtimes
 from netkf.runs.stored import StoredRun
 from netkf.runs.summary import nees_bounds
 from netkf.studies.consistency import judged_blocks
@@ -27,7 +28,7 @@ MAX_LINKS = 20_000
 """Directed links that a page draws."""
 MAX_MARKS = 5_000
 """Events of the kinds MARKS that a page holds."""
-MARKS = ("stop", "crash", "restart", "diverged", "swap")
+MARKS = ("stop", "crash", "restart", "join", "leave", "diverged", "swap")
 """Kinds of events of nodes that views mark beside samples and messages."""
 ELLIPSE_LEVEL = 0.95  # probability within the ellipses and intervals that are drawn
 
@@ -75,6 +76,10 @@ def run_data(
         "messages": _message_columns(thinned, run, packer),
         "senses": _event_columns(run, ("sense",), budget.messages // 2, packer),
         "marks": _event_columns(run, MARKS, MAX_MARKS, packer),
+        "down": [
+            (run.nodes.index(one.node), one.begin, min(one.end, 2.0 * horizon))
+            for one in downtimes(source.scenario, run.seed, run.replica)
+        ],
         "innovations": innovation_columns(readings, run, budget.messages // 4, packer),
         "traffic": bin_messages(messages, horizon, BINS),
         "totals": {

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import shlex
 from typing import NamedTuple
 
 import numpy as np
@@ -51,7 +52,8 @@ def explain_worst(source: ReportSource) -> Why | str | None:
 
 
 def _why_command(source: ReportSource, worst: WorstSample) -> str:
-    return f"netkf why {source.label} --node {worst.node} --at {worst.time:.10g}"
+    command = ["netkf", "why", source.label, "--node", str(worst.node)]
+    return f"{shlex.join(command)} --at {worst.time:.10g}"
 
 
 def describe_mending(explanation: Why) -> str:
@@ -116,11 +118,11 @@ def describe_central(source: ReportSource, explanation: Why, central: CentralSam
         return f"{sentence}. Its trace P is no less than that of this node with no message missing"
     clock = source.scenario.network.activation
     has_rate = isinstance(clock, LinkClock) and hasattr(clock, "rate")
-    advice = "netkf size finds the rate that would suffice, " if has_rate else ""
+    advice = "netkf size finds the rate that would suffice, and " if has_rate else ""
     return (
         f"{sentence}. The rest of trace P {format_number(best.trace)} is the price of rare "
         "exchanges and of the way nodes combine the information that they receive: "
-        f"{advice}netkf compare-filters a filter that loses less"
+        f"{advice}netkf compare-filters finds filters that lose less"
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from netkf.core.printable import shorten
 from netkf.linalg.arrays import FloatArray
 from netkf.report.markup import paragraph, text
 from netkf.runs.outcomes import (
@@ -20,7 +21,8 @@ from netkf.trace.run import Run
 MAX_NODES = 24
 """Nodes up to which matrices are shown."""
 CELL, MARGIN = 34, 42
-"""Pixels: the cell of a matrix, the room for labels."""
+LETTER, LETTERS = 7, 24
+"""Pixels: the cell of a matrix, the least room for labels, a letter; and the longest label."""
 WIDTH, HEIGHT, WINDOWS = 620, 110, 60
 """Pixels of losses over time, and the parts of the time."""
 DARKEST = 0.55
@@ -59,23 +61,27 @@ def _box(width: int, height: int, caption: str, content: str) -> str:
 def _matrix(values: FloatArray, names: list[str], caption: str) -> str:
     """Return a matrix (N, N), the darker a cell the farther its value is from 0; nan is empty."""
     cells = []
+    names = [shorten(name, LETTERS) for name in names]
+    margin = max(MARGIN, 12 + LETTER * max(map(len, names)))
     for k, name in enumerate(names):
-        middle = MARGIN + CELL * k + CELL // 2
+        middle = margin + CELL * k + CELL // 2
+        place, turn = (f"{middle} {margin - 8}", "middle"), ""
+        if margin > MARGIN:  # names that are wider than a cell stand upright
+            place, turn = (f"{middle + 4} {margin - 8}", "start"), "rotate(-90)"
         cells.append(
-            f'<text x="{middle}" y="{MARGIN - 8}" text-anchor="middle">{text(name)}</text>'
-        )
-        cells.append(
-            f'<text x="{MARGIN - 8}" y="{middle + 4}" text-anchor="end">{text(name)}</text>'
+            f'<text transform="translate({place[0]}) {turn}" text-anchor="{place[1]}">'
+            f"{text(name)}</text>"
+            f'<text x="{margin - 8}" y="{middle + 4}" text-anchor="end">{text(name)}</text>'
         )
     for i, j in np.argwhere(np.isfinite(values)).tolist():
-        value, x, y = float(values[i, j]), MARGIN + CELL * j, MARGIN + CELL * i
+        value, x, y = float(values[i, j]), margin + CELL * j, margin + CELL * i
         opacity = DARKEST * min(abs(value), 1.0)
         cells.append(
             f'<rect x="{x}" y="{y}" width="{CELL - 1}" height="{CELL - 1}" '
             f'fill-opacity="{opacity:.3f}"/><text x="{x + CELL // 2}" y="{y + CELL // 2 + 4}" '
             f'text-anchor="middle">{value:.2f}</text>'
         )
-    side = MARGIN + CELL * len(names)
+    side = margin + CELL * len(names)
     return _box(side, side, caption, "".join(cells))
 
 

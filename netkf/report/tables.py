@@ -288,11 +288,14 @@ def _matrix_traces(matrices: FloatArray) -> FloatArray:
 
 
 def averages(source: ReportSource) -> list[dict[str, Any]] | None:
-    """Return averages of each node by the names in summary.json; None without a summary."""
+    """Return name and averages of each node, as in summary.json; None without a summary."""
     if not source.summary:
         return None
     names = ["node", *COLUMNS, *(f"{name}_se" for name in COLUMNS)]
-    return [{name: row[name] for name in names if name in row} for row in source.summary["nodes"]]
+    return [
+        {"name": str(row["node"])} | {name: row[name] for name in names if name in row}
+        for row in source.summary["nodes"]
+    ]
 
 
 def _interval_curves(mean: Any, error: Any) -> list[list[float | None]]:

@@ -214,7 +214,9 @@ def _read_states(
         x = np.full((T, scenario.plant.n), np.nan)
         for k, view in enumerate(scenario.views):
             x[:, view] = seen[:, k, : len(view)]
-    return table, {"times": times, "x": x, "xhat": xhat, "P": P, "error": seen - xhat}
+    with np.errstate(invalid="ignore"):  # a run that diverged ends with infinite numbers
+        error = seen - xhat
+    return table, {"times": times, "x": x, "xhat": xhat, "P": P, "error": error}
 
 
 def _read_events(path: Path, scenario: Scenario, replica: int) -> np.ndarray:

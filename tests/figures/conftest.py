@@ -1,5 +1,6 @@
 """Small results of every kind, simulated once: what figures have to cope with."""
 
+import networkx as nx
 import pytest
 
 import netkf
@@ -37,6 +38,31 @@ def one_node():
     )
 
 
+NAMES = (
+    "$\\frac$",
+    "<b>x</b>",
+    "a, b",
+    "a node whose name goes " + "on and on " * 9,
+    "Zo\u00eb",
+    "=1",
+)
+
+
+def named_nodes():
+    """A path of nodes whose names are no formulas, no markup, and too long for any axis."""
+    changes = {
+        "horizon": 4.0,
+        "network.graph": nx.path_graph(len(NAMES)),
+        "network.activation.at": "nodes",
+        "network.channel.symmetric": False,
+        "sensors.0.nodes": [NAMES[0], NAMES[3]],
+        "plant.states": ["$\\frac$", "x_{"],
+        "plant.units": ["$m$", "$m$"],
+    }
+    changes["network.graph"] = nx.relabel_nodes(changes["network.graph"], dict(enumerate(NAMES)))
+    return netkf.load(RING, changes)
+
+
 def make(kind, folder):
     """Return the result of a kind; some are read back from ``folder``."""
     if kind == "ring":
@@ -61,12 +87,15 @@ def make(kind, folder):
         changes = {"horizon": 1100.0, "probe": 10.0, "plant.F": [[0.0, -2.0], [2.0, 0.0]]}
         scenario = netkf.load(SCENARIOS / "gossip_periodic.toml", changes)
         return netkf.simulate(scenario)
+    if kind == "names":
+        return netkf.simulate(named_nodes(), engine="simpy")
     assert kind == "slots"
     return netkf.simulate(netkf.load(SCENARIOS / "intermittent_scalar.toml"))
 
 
 KINDS = (
     "ring", "ensemble", "one node", "no truth", "no samples", "interrupted", "diverged", "slots",
+    "names",
 )  # fmt: skip
 
 

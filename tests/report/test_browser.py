@@ -10,6 +10,7 @@ import random
 import shutil
 from pathlib import Path
 
+import networkx as nx
 import numpy as np
 import pytest
 
@@ -422,6 +423,22 @@ def test_curves_over_many_orders_of_magnitude_are_drawn(look, build, tmp_path):
     # All charts show the whole horizon, of which the run lived until its numbers ended.
     lived = netkf.open(directory).times[-1] / 600.0
     assert page.evaluate(blue) > 0.6 * lived > 0.1
+
+
+def test_nodes_are_shown_by_their_names(look, tmp_path):
+    names = ["zero", "<b>one</b>", 'two, "2"']
+    graph = nx.relabel_nodes(nx.path_graph(3), dict(enumerate(names)))
+    changes = {"horizon": 1.0, "network.graph": graph, "sensors.0.nodes": ["zero"]}
+    scenario = netkf.load(SCENARIOS / "poisson_ring.toml", changes)
+    directory = run_to_directory(scenario, tmp_path / "run").directory
+    page = look(write_report([directory], tmp_path / "page.html"))
+    page.click("text=All nodes at this time as a table")
+    assert page.locator("#table tbody th").all_text_contents() == names
+    page.select_option("#node", "2")
+    page.wait_for_function(
+        "document.getElementById('state').textContent.includes('node two, \"2\" has')"
+    )
+    assert "node 2" not in page.inner_text("body")
 
 
 def test_markup_in_texts_runs_nothing(look, tmp_path):

@@ -10,6 +10,7 @@ from functools import cache
 from types import SimpleNamespace
 
 import matplotlib
+import networkx as nx
 import numpy as np
 import pandas as pd
 import pytest
@@ -131,6 +132,25 @@ def test_texts_of_files_are_escaped(tmp_path):
     assert text.count("<script") == 3
     assert "\u202e" not in text  # changes the direction of what follows
     assert page.data["runs"][0]["name"] == scenario.name
+
+
+def test_nodes_have_their_names_and_say_when_they_were_down(tmp_path):
+    names = ["a b", "c'd", "<e>"]
+    lives = [{"nodes": ["<e>"], "kind": "duty", "period": 8.0, "up": 2.0}]
+    changes = {
+        "horizon": 6.0,
+        "network.graph": nx.relabel_nodes(nx.path_graph(3), dict(enumerate(names))),
+        "sensors.0.nodes": ["a b"],
+        "network.lives": lives,
+    }
+    scenario = netkf.load(SCENARIOS / "poisson_ring.toml", changes)
+    directory = run_to_directory(scenario, tmp_path / "my run", engine="simpy").directory
+    page = page_of(directory)
+    assert [row["name"] for row in page.data["summaries"][0]] == names
+    assert page.data["runs"][0]["down"] == [[2, 2.0, 12.0]]
+    assert "Node <e> was worst" in page.shown
+    assert re.search(r"It was down at t = [2-6]\S* s, since t = 2 s", page.shown)
+    assert f"netkf why '{directory}' --node '<e>' --at" in page.shown
 
 
 @pytest.mark.parametrize("value", ["</script>", "<!--", "]]>", "\u2028", "a&lt;b"])

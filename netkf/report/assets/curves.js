@@ -6,7 +6,7 @@ const Curves = (() => {
   // series: { label, x, y, low, high, colour, dash, width, points, dots, mark }, all over the same x
   // where there is a band; `dots` has no line, nor has `mark` (dot, ring, tick), whose limits are
   // bars. `timed` curves follow the clock; those that are `apart` have a logarithmic scale.
-  function figure(app, { title, note, unit, xlabel, series, lines, band, timed, apart }) {
+  function figure(app, { title, note, unit, xlabel, names, series, lines, band, timed, apart }) {
     const box = Format.element("div", { class: "plot" });
     const whole = Format.element("figure", { class: "curve" },
       Format.element("figcaption", {}, Format.element("strong", {}, title), " ", note || ""), box,
@@ -32,7 +32,7 @@ const Curves = (() => {
         cursor: { drag: { x: Boolean(timed), y: false, setScale: false, dist: 6 }, y: false },
         scales: { x: { time: false, ...(timed ? { range: (u, low, high) => app.span || (app.runs.length ? [0, app.end] : [low, high > low ? high : low + 1]) } : {}), ...(xlabel === "node" ? { range: (u, low, high) => [low - 0.5, high + 0.5] } : {}) }, y: { range: (u, low, high) => yRange(low, high, lines, band, steep) } },
         axes: [{ ...axis, label: xlabel || "time (s)", labelSize: 22, size: 34,
-          ...(WHOLE.includes(xlabel) ? { values: (u, splits) => splits.map((v) => (Number.isInteger(v) ? String(v) : "")) } : {}) }, { ...axis, label: unit, labelFont: Math.min(12, 360 / unit.length) + "px system-ui, sans-serif", labelSize: 20, size: 58, values: (u, splits) => splits.map(steep ? powerOfTen : tick) }],
+          ...(WHOLE.includes(xlabel) ? { values: (u, splits) => splits.map((v) => (Number.isInteger(v) ? Format.brief(names && names.has(v) ? names.get(v) : v, 10) : "")) } : {}) }, { ...axis, label: unit, labelFont: Math.min(12, 360 / unit.length) + "px system-ui, sans-serif", labelSize: 20, size: 58, values: (u, splits) => splits.map(steep ? powerOfTen : tick) }],
         series: [{}, ...expanded(series)],
         bands: bandsOf(series),
         hooks: { setSelect: [(u) => {

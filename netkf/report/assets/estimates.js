@@ -73,7 +73,7 @@ const Estimates = (() => {
       for (const [u, v] of curve) context.lineTo(axes.x(s.xhat[a] + u), axes.y(s.xhat[b] + v));
       context.stroke();
       dot(context, axes.x(s.xhat[a]), axes.y(s.xhat[b]), chosen ? 4 : 2.5);
-      if (chosen) Theme.write(context, "node " + s.node, axes.x(s.xhat[a]) + 7, axes.y(s.xhat[b]) - 8);
+      if (chosen) Theme.write(context, "node " + run.names[app.nodeOf(run)], axes.x(s.xhat[a]) + 7, axes.y(s.xhat[b]) - 8);
     }
 
     function drawIntervals(context, width, height, nodes, x, a, span) {

@@ -43,12 +43,18 @@ const Figures = (() => {
     });
   }
 
+  // The node in focus by its name, in the r-th run, whose live views the page may not have.
+  function nodeName(app, r) {
+    const row = (page.summaries[r] || []).find((found) => found.node === app.nodeId);
+    return row ? row.name : app.nodeId;
+  }
+
   // How the runs of an ensemble spread about the one that moves.
   function spread(app, r, name) {
     const found = page.ensembles[r], entry = found && found.spread && found.spread[String(app.nodeId)];
     if (!entry) return [];
     const [y, low, high] = entry;
-    return [{ label: name + "error of node " + app.nodeId + ", median of all runs; shaded: 90 % of them", x: found.times, y, low, high, colour: coloured(page.runs, r, "purple"), width: 1, dash: "dotted" }];
+    return [{ label: name + "error of node " + nodeName(app, r) + ", median of all runs; shaded: 90 % of them", x: found.times, y, low, high, colour: coloured(page.runs, r, "purple"), width: 1, dash: "dotted" }];
   }
 
   // Which run of an ensemble moves.
@@ -175,9 +181,10 @@ const Figures = (() => {
 
   // Nodes have no order: dots with error bars, those of two runs beside each other.
   function averages(app, summaries) {
-    const series = [], many = summaries.length > 1;
+    const series = [], many = summaries.length > 1, names = new Map();
     summaries.forEach((rows, r) => {
       if (!rows) return;
+      for (const row of rows) if (names.get(row.node) !== row.name) names.set(row.node, names.has(row.node) ? row.node : row.name);
       const x = rows.map((row) => row.node + (many ? 0.24 * r - 0.12 : 0)), name = letter(summaries, r);
       const of = (key) => rows.map((row) => row[key]);
       const wide = (key, side) => rows.map((row) => (row[key + "_se"] ? row[key] + side * 2 * row[key + "_se"] : row[key]));
@@ -188,7 +195,7 @@ const Figures = (() => {
       series.push({ label: name + "square root of mean trace P", x, y: root(of("mean_trace")), colour: coloured(summaries, r, "green"), mark: "ring" });
       if (of("bound").some(Number.isFinite)) series.push({ label: name + "square root of its bound", x, y: root(of("bound").map((v) => v ?? NaN)), colour: coloured(summaries, r, "ink"), mark: "tick" });
     });
-    return series.length ? { title: "Averages per node", unit: page.unit, xlabel: "node", series, note: "Root mean squares over time; the numbers stand in the table." } : null;
+    return series.length ? { title: "Averages per node", unit: page.unit, xlabel: "node", names, series, note: "Root mean squares over time; the numbers stand in the table." } : null;
   }
 
   function ensemble(app, ensembles) {
@@ -198,8 +205,8 @@ const Figures = (() => {
       if (!entry) return;
       const name = letter(ensembles, r), x = found.times;
       const add = (label, [y, low, high], colour, dash) => series.push({ label: name + label, x, y, low, high, colour, dash, width: 2 });
-      if (entry.square[0].some(Number.isFinite)) add("mean squared error of node " + app.nodeId, entry.square, page.series[r], "solid");
-      add("mean trace P of node " + app.nodeId, entry.trace, coloured(ensembles, r, "green"), "dashed");
+      if (entry.square[0].some(Number.isFinite)) add("mean squared error of node " + nodeName(app, r), entry.square, page.series[r], "solid");
+      add("mean trace P of node " + nodeName(app, r), entry.trace, coloured(ensembles, r, "green"), "dashed");
       if (entry.bound) series.push({ label: name + "bound H(12)", x, y: entry.bound, colour: coloured(ensembles, r, "ink"), dash: "dotted", width: 2 });
     });
     return series.length ? { title: "Mean over the runs", unit: "squared " + page.unit, timed: true, series, note: "Shaded: at least two standard errors on each side." } : null;
@@ -211,7 +218,7 @@ const Figures = (() => {
       const entry = found && found.nodes[String(app.nodeId)];
       if (!entry || !entry.nees[0].some(Number.isFinite)) return;
       const [y, low, high] = entry.nees;
-      series.push({ label: letter(ensembles, r) + "mean NEES of node " + app.nodeId, x: found.times, y, low, high, colour: page.series[r], width: 2 });
+      series.push({ label: letter(ensembles, r) + "mean NEES of node " + nodeName(app, r), x: found.times, y, low, high, colour: page.series[r], width: 2 });
     });
     const known = ensembles.find((found) => found && found.nodes[String(app.nodeId)]);
     return series.length ? { title: "Does P fit the error, on average?", unit: "mean NEES", timed: true, series, band: known.nodes[String(app.nodeId)].nees_interval, note: "Shaded in the colour of a curve: two standard errors." } : null;
@@ -222,7 +229,7 @@ const Figures = (() => {
     if (!entry) return null;
     const [y, low, high] = entry, x = found.times;
     const sure = y.map((v, k) => (low[k] > 0 || high[k] < 0 ? v : NaN));
-    const series = [{ label: "B - A, mean squared error of node " + app.nodeId + "; shaded: interval", x, y, low, high, colour: "purple" }];
+    const series = [{ label: "B - A, mean squared error of node " + nodeName(app, 0) + "; shaded: interval", x, y, low, high, colour: "purple" }];
     if (sure.some(Number.isFinite)) series.push({ label: "certain: the interval leaves out 0", x, y: sure, colour: "ink", points: true, width: 3 });
     const title = sure.some(Number.isFinite) ? "Where they differ for certain" : "The difference over time, nowhere certain";
     return { title, unit: "squared " + page.unit, timed: true, series, lines: [{ label: "no difference", y: 0, colour: "ink", dash: "dotted" }],

@@ -37,6 +37,11 @@ const Format = (() => {
     return String(value).replace(/\B(?=(\d{3})+(?!\d))/g, ",");
   }
 
+  function brief(value, most) {
+    const name = String(value);
+    return name.length > most ? name.slice(0, most - 1) + "\u2026" : name;
+  }
+
   function element(tag, attributes, ...children) {
     const svg = ["svg", "g", "line", "path", "circle", "rect", "text", "title", "polygon"].includes(tag);
     const made = svg
@@ -86,5 +91,5 @@ const Format = (() => {
     }
   }
 
-  return { number, time, count, element, table, csv, offerTables };
+  return { number, time, count, brief, element, table, csv, offerTables };
 })();

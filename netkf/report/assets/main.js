@@ -133,7 +133,7 @@ function say() {
     if (state.sample === null) parts.push("no sample yet");
     else if (i >= 0) {
       const s = state.nodes[i];
-      parts.push("node " + s.node + (run.truth ? " has error " + Format.number(s.error) : "") +
+      parts.push("node " + run.names[i] + (run.truth ? " has error " + Format.number(s.error) : "") +
         (run.truth ? " and" : " has") + " square root of trace P " + Format.number(Math.sqrt(s.trace)) +
         " (sample of " + Format.time(state.sample) + " s)");
     }
@@ -154,7 +154,7 @@ function nodeTable(run, r) {
   const state = State.at(run, app.time, 0), [a, b] = app.axes, n = run.n;
   const parts = a === b ? [a] : [a, b], inUnit = page.unit === "units of the state" ? "" : " (" + page.unit + ")";
   const header = ["node", ...parts.flatMap((c) => [run.states[c].replace(/^x(?=\d)/, "xhat"), "95 % +-"]), "trace P", "error" + inUnit, "NEES", "age of information (s)"];
-  const rows = state.nodes.map((s) => [s.node,
+  const rows = state.nodes.map((s, i) => [run.names[i],
     ...parts.flatMap((c) => [Format.number(s.xhat[c]), Format.number(run.scale.interval * Math.sqrt(State.variance(s.P, n, c, c)))]),
     Format.number(s.trace), Format.number(s.error), Format.number(s.nees), Format.number(s.age)]);
   const truth = state.x ? "; truth " + parts.map((c) => run.states[c] + " = " + Format.number(state.x[c])).join(", ") : "; no truth that all share is known";

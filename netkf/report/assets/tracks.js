@@ -91,7 +91,7 @@ const Tracks = (() => {
     context.textBaseline = "middle";
     context.textAlign = "right";
     context.fillStyle = Theme.colours.ink;
-    context.fillText(row.name.length > 15 ? row.name.slice(0, 14) + "\u2026" : row.name, LEFT - 6, y + ROW / 2);
+    context.fillText(Format.brief(row.name, 15), LEFT - 6, y + ROW / 2);
   }
 
   function drawAxis(context, scale, y) {

@@ -149,7 +149,7 @@ const Why = (() => {
     if (found.readings.length) parts.push(readingTable(run, node, found.readings, t));
     parts.push(lostList(run, found.links));
     parts.push(Format.element("p", {}, "What it would have been had these messages come, replayed: ",
-      Format.element("code", {}, "netkf why " + quoted(run.label) + " --node " + run.names[node] + " --at " + Format.time(t) + (run.replica ? " --replica " + run.replica : ""))));
+      Format.element("code", {}, "netkf why " + quoted(run.label) + " --node " + quoted(String(run.names[node])) + " --at " + Format.time(t) + (run.replica ? " --replica " + run.replica : ""))));
     box.replaceChildren(...parts);
   }
 
@@ -172,6 +172,8 @@ const Why = (() => {
       parts.push("square root of trace P " + Format.number(Math.sqrt(s.trace)) + ".");
       if (Number.isFinite(s.nees)) parts.push("NEES " + Format.number(s.nees) + ", expected " + run.samples.sizes[node] + " where P is exact.");
     }
+    const down = run.down.find(([i, begin, end]) => i === node && begin <= t && t < end);
+    if (down) parts.push("It was down, since " + Format.time(down[1]) + " s.");
     const lost = found.links.reduce((sum, link) => sum + bad(run, link).length, 0);
     const oldest = found.links[0];
     if (oldest) {
