@@ -25,7 +25,7 @@ def _run(options: argparse.Namespace) -> int:
     draw = None
     if not options.no_plot:
         draw = partial(pictures.draw_picture, pictures.ENSEMBLE, plan.scenario)
-    with lock_directory(options.directory):
+    with lock_directory(options.directory, option="DIR"):
         merged = merge_plan(plan, options.mixed, finish=draw, note=lambda text: print_notes([text]))
     runs = plan.identity.runs
     if isinstance(merged, list):

@@ -47,9 +47,13 @@ def plan_study(run: Run, options: argparse.Namespace) -> int:
             remedy = "leave it out; netkf work has --workers"
             rule = "does not go with --plan, which runs nothing"
             raise ScenarioError(f"--{name}", rule, getattr(options, name), remedy)
-    with lock_directory(getattr(options, "out", None), must_be_empty=True):
+    out = getattr(options, "out", None)
+    if out is not None and options.plan.resolve().is_relative_to(out.resolve()):
+        rule, remedy = "must lie outside of the directory of the results", "choose another"
+        raise ScenarioError("--plan", rule, str(options.plan), remedy)
+    with lock_directory(out, must_be_empty=True):
         pass  # that of the results
-    with lock_directory(options.plan, must_be_empty=True):
+    with lock_directory(options.plan, must_be_empty=True, option="--plan"):
         gaps = _missing_runs(run, options, PlannedStudy(options.plan, Worker(None), returns=False))
         runs = [gap.runs for gap in gaps]
         tasks = min(options.tasks, max(runs, default=1))

@@ -15,9 +15,12 @@ from netkf.runs.files import create_output_directory, make_directory
 
 
 @contextlib.contextmanager
-def lock_directory(directory: Path | None, must_be_empty: bool = False) -> Iterator[None]:
-    """Create a directory and hold its lock, which dies with the process, during the body; nothing
-    for None. Notes where locks are not supported; removes a new directory that stays empty.
+def lock_directory(
+    directory: Path | None, must_be_empty: bool = False, option: str = "--out"
+) -> Iterator[None]:
+    """Create a directory, which an ``option`` names, and hold its lock, which dies with the
+    process, during the body; nothing for None. Notes where locks are not supported; removes a new
+    directory that stays empty.
 
     Raises ScenarioError if another command holds the lock, if it cannot be created, or if it
     ``must_be_empty`` and is not.
@@ -29,9 +32,9 @@ def lock_directory(directory: Path | None, must_be_empty: bool = False) -> Itera
     is_new = not os.path.exists(directory)
     make_directory(directory)
     try:
-        with _hold_lock(directory):
+        with _hold_lock(directory, option):
             if must_be_empty:
-                create_output_directory(directory, "")
+                create_output_directory(directory, "", option)
             yield
     finally:
         if is_new:
@@ -40,14 +43,14 @@ def lock_directory(directory: Path | None, must_be_empty: bool = False) -> Itera
 
 
 @contextlib.contextmanager
-def _hold_lock(directory: Path) -> Iterator[None]:
+def _hold_lock(directory: Path, option: str) -> Iterator[None]:
     descriptor = None
     try:
         descriptor = _open_lock_file(directory)
     except OSError as error:
         _print_note(directory, error)
     else:
-        _lock_or_refuse(descriptor, directory)
+        _lock_or_refuse(descriptor, directory, option)
     try:
         yield
     finally:
@@ -56,7 +59,7 @@ def _hold_lock(directory: Path) -> Iterator[None]:
                 os.close(descriptor)
 
 
-def _lock_or_refuse(descriptor: int, directory: Path) -> None:
+def _lock_or_refuse(descriptor: int, directory: Path, option: str) -> None:
     """Lock the open file ``descriptor`` that stands for ``directory``, without waiting."""
     try:
         _lock_file(descriptor)
@@ -64,7 +67,7 @@ def _lock_or_refuse(descriptor: int, directory: Path) -> None:
         os.close(descriptor)
         rule = "is in use: another netkf command writes there"
         remedy = "wait for its end, or choose another"
-        raise ScenarioError("--out", rule, str(directory), remedy) from None
+        raise ScenarioError(option, rule, str(directory), remedy) from None
     except OSError as error:
         _print_note(directory, error)
 

@@ -134,8 +134,10 @@ def to_json_value(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def create_output_directory(requested: Path | None, name: str) -> Path:
-    """Return a directory for results: ``requested``, if empty (ScenarioError), or runs/NAME-k."""
+def create_output_directory(requested: Path | None, name: str, option: str = "--out") -> Path:
+    """Return a directory for results: ``requested`` by an option, if empty (ScenarioError), or
+    runs/NAME-k.
+    """
     if requested is None:
         safe = "".join(c if c.isalnum() or c in "-_." else "-" for c in name)[:100].strip(".")
         paths = (Path("runs") / f"{safe or 'run'}-{k}" for k in range(1, 1_000_000))
@@ -144,7 +146,7 @@ def create_output_directory(requested: Path | None, name: str) -> Path:
     make_directory(requested)
     if any(requested.iterdir()):
         raise ScenarioError(
-            "--out",
+            option,
             "must be a new or empty directory",
             str(requested),
             "choose another, or remove it first",

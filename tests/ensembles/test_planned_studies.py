@@ -252,7 +252,10 @@ def test_what_is_no_plan_of_a_study_is_refused_in_one_line(plan, tmp_path, capsy
         (["--workers", "2"], "does not go with --plan"),
         (["--vary", "network.activation.rat=1"], "did you mean"),
         (["--out", str(SCENARIOS)], "must be a new or empty directory"),
-        (["--plan", str(SCENARIOS)], "must be a new or empty directory"),
+        (["--plan", str(SCENARIOS)], "--plan: must be a new or empty directory"),
+        # Results are written into an empty directory.
+        (["--out", "nowhere", "--plan", "nowhere"], "--plan: must lie outside"),
+        (["--out", "nowhere", "--plan", "nowhere/plan"], "--plan: must lie outside"),
     ],
 )
 def test_a_bad_command_line_writes_no_plan(options, words, tmp_path, capsys):
