@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import errno
 import math
+import re
 import shlex
 from collections.abc import Sequence
 from dataclasses import replace
@@ -430,14 +432,21 @@ def _source_command(source: ReportSource) -> str:
         verdict = source.verdict
         command += f" --runs {verdict['runs']} --confidence {verdict['confidence']:g}"
     if source.filters is not None:
-        options = []
-        for row in source.filters.rows:
-            # The label of a filter is its kind, then its settings as key=value.
-            kind, *settings = row.filter.split(" ")
-            table = ", ".join([f'kind="{kind}"', *settings])
-            options.append(f"{{{table}}}" if settings else kind)
+        options = map(_filter_option, (row.filter for row in source.filters.rows))
         command += f" --filters {shlex.quote(','.join(options))}"
     return command
+
+
+def _filter_option(label: str) -> str:
+    """Return what ``--filters`` takes for the label of a filter: its kind, then key=value."""
+    kind, *settings = re.split(r" (?=\w+=)", label)
+    table: dict[str, Any] = {"kind": kind}
+    for key, _, value in (setting.partition("=") for setting in settings):
+        try:
+            table[key] = ast.literal_eval(value)
+        except (SyntaxError, ValueError):  # a text, which has no quotes
+            table[key] = value
+    return toml_text(table) if settings else kind
 
 
 @cache

@@ -757,6 +757,12 @@ def test_sweeps_are_not_compared(ring, sweep):
         ("run", "--runs 4"),
         ("sweep", "--runs 3 --vary network.channel.symmetric=true,false"),
         ("check", "--runs 60 --confidence 0.9"),
+        (
+            "compare-filters",
+            '--runs 2 --filters \'gossip,{ kind = "hcmci", steps = 2, consensus = "information" },'
+            '{ kind = "event-triggered", inner = { kind = "kcf", epsilon = 0.1 }, '
+            "thresholds = [0.1, 0.2] }'",
+        ),
     ],
 )
 def test_the_command_that_computes_results_again_is_the_one_that_did(tmp_path, command, options):
