@@ -23,7 +23,7 @@ class Quantisation(Component):
 
     Both ends know a dither u, uniform over a step of ``2 range / 2^bits``: the sender rounds z + u,
     the receiver subtracts u. The error is then uniform over a step, whatever z is, and independent
-    of it and of other errors (Roberts 1962; Schuchman 1964).
+    of it and of other errors (Roberts 1962; Schuchman 1964). Only exact zeros are received as 0.
     """
 
     bits: int = field(integer(low=1, high=MAX_BITS))
@@ -45,7 +45,8 @@ class Quantisation(Component):
         level = np.floor((values + dither + self.range) / self.step)
         kept = np.clip(level, 0.0, 2.0**self.bits - 1.0)
         received = (kept + 0.5) * self.step - self.range - dither
-        return received, int((kept != level).sum())
+        # What has heard of no mass must not divide by an error: nothing is told as nothing.
+        return np.where(values == 0.0, 0.0, received), int((kept != level).sum())
 
 
 class Encoder:
