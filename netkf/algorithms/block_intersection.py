@@ -162,30 +162,32 @@ def absorb(record: Any, h: int, run: Any) -> None:
 
 @kernel
 def hear(record: Any, h: int, run: Any, k: int, q: int) -> None:
-    """Use message ``k`` of the inbox in lane ``q``."""
+    """Use message ``k`` of the inbox in lane ``q``: all that it tells at once, since the sender's
+    error is in all of it.
+    """
     f, tables, pairs, m, r = record.fusion, record.tables, run.pairs, run.message[k], run.heard[k]
-    n, root, count = len(f.x), record.root, 0
+    n, root = len(f.x), record.root
     for i in range(n):
         f.x[i] = record.xhat[h, i, q]
     set_covariances(root, record.dependent, h, q, f.P, f.dependent)
     payload = record.payload
     set_covariances(payload.root, payload.dependent, m, q, record.heard_P, record.heard_D)
+    f.noise[:], f.H[:], record.weights[:] = 0.0, 0.0, 0.0
     for i in range(tables.entry.shape[1]):
         record.heard_x[i] = payload.xhat[m, i, q]
-        if tables.entry[run.link[k], i] >= 0:
-            count += 1
-    if count > 0:
-        if run.age[k] > 0.0:
-            predict_sent_blocks(record, h, run, k)
-        use_common(record, run.link[k])
-        fuse(f, count, record.rule)
+    if run.age[k] > 0.0:
+        predict_sent_blocks(record, h, run, k)
+    count = use_common(record, run.link[k])
     # A reading that took time is of a state that noise has moved since, which is in errors too.
     if r >= 0 and len(pairs.row) > 0 and not run.age[k] > 0.0:
         for c in range(pairs.first[r], pairs.first[r + 1]):
             block = block_of_pair(pairs, c)
             if block >= 0 and tables.first[h, block] >= 0:
-                use_pair(record, h, run, (m, r, c), q)
-                fuse(f, pairs.length[c], record.rule)
+                use_pair(record, h, run, (m, r, c), q, count)
+                count += pairs.length[c]
+    if count > 0:
+        weigh_sender(record, h, count)
+        fuse(f, count, record.rule)
     for i in range(n):
         record.xhat[h, i, q] = f.x[i]
         for j in range(n):
@@ -241,29 +243,27 @@ def predict_sent_blocks(record: Any, h: int, run: Any, k: int) -> None:
 
 
 @kernel
-def use_common(record: Any, link: int) -> None:
-    """Make the sender's estimate of what both estimate an observation."""
-    f, entry = record.fusion, record.tables.entry
-    row = 0
+def use_common(record: Any, link: int) -> int:
+    """Make the sender's estimate of what both estimate the first rows of an observation; return
+    how many they are.
+    """
+    f, entry, row = record.fusion, record.tables.entry, 0
     for i in range(entry.shape[1]):
-        if entry[link, i] < 0:
-            continue
-        f.z[row] = record.heard_x[i]
-        f.H[row, :] = 0.0
-        f.H[row, entry[link, i]] = 1.0
-        column = 0
-        for j in range(entry.shape[1]):
-            if entry[link, j] >= 0:
-                f.heard[row, column] = record.heard_D[i, j]
-                f.told[row, column] = record.heard_P[i, j] - record.heard_D[i, j]
-                f.noise[row, column] = 0.0
-                column += 1
-        row += 1
+        if entry[link, i] >= 0:
+            f.z[row] = record.heard_x[i]
+            f.H[row, entry[link, i]] = 1.0
+            record.weights[row, i] = -1.0
+            row += 1
+    return row
 
 
 @kernel
-def use_pair(record: Any, h: int, run: Any, which: tuple[int, int, int], q: int) -> None:
-    """Make a reading of a pair, ``which`` = (m, r, c) with payload m, an observation."""
+def use_pair(
+    record: Any, h: int, run: Any, which: tuple[int, int, int], q: int, start: int
+) -> None:
+    """Make a reading of a pair, ``which`` = (m, r, c) with payload m, rows of an observation, from
+    row ``start`` on.
+    """
     f, tables, pairs, (m, r, c) = record.fusion, record.tables, run.pairs, which
     rows, own, block = pairs.rows, pairs.own, block_of_pair(pairs, c)
     first, size, count = tables.first[h, block], tables.size[block], pairs.length[c]
@@ -275,22 +275,33 @@ def use_pair(record: Any, h: int, run: Any, which: tuple[int, int, int], q: int)
         rows.x[own + i] = record.xhat[h, first + i, q]
     linearise_pair(pairs, run, r, c, q)
     for a in range(count):
-        f.z[a] = rows.value[a]
-        f.H[a, :] = 0.0
+        f.z[start + a] = rows.value[a]
         for i in range(own):
-            f.z[a] -= rows.J[a, i] * record.payload.xhat[m, i, q]
+            f.z[start + a] -= rows.J[a, i] * record.payload.xhat[m, i, q]
+            record.weights[start + a, i] = rows.J[a, i]
         for i in range(size):
-            f.H[a, first + i] = rows.J[a, own + i]
+            f.H[start + a, first + i] = rows.J[a, own + i]
+        for b in range(count):
+            f.noise[start + a, start + b] = rows.C[a, b]
+
+
+@kernel
+def weigh_sender(record: Any, h: int, count: int) -> None:
+    """Write the covariances of ``count`` rows of an observation which have the sender's error with
+    ``weights``: of its dependent part and of the other one.
+    """
+    f, G, width = record.fusion, record.weights, len(record.heard_x)
+    for a in range(count):
         for b in range(count):
             P = D = 0.0
-            for i in range(own):
-                for j in range(own):
-                    P += rows.J[a, i] * record.heard_P[i, j] * rows.J[b, j]
-                    D += rows.J[a, i] * record.heard_D[i, j] * rows.J[b, j]
-            f.heard[a, b], f.told[a, b], f.noise[a, b] = D, P - D, rows.C[a, b]
-            # Others that estimate this block may use the same reading.
+            for i in range(width):
+                for j in range(width):
+                    P += G[a, i] * record.heard_P[i, j] * G[b, j]
+                    D += G[a, i] * record.heard_D[i, j] * G[b, j]
+            f.heard[a, b], f.told[a, b] = D, P - D
+            # Others that estimate these blocks may use the same readings.
             if record.alone[h] == 0:
-                f.told[a, b], f.noise[a, b] = P - D + rows.C[a, b], 0.0
+                f.told[a, b], f.noise[a, b] = P - D + f.noise[a, b], 0.0
 
 
 def block_record(
@@ -299,7 +310,7 @@ def block_record(
     """Return the record: what is in every node's error but may be in those of others too."""
     n, tables = len(models[0].information), block_tables(infos, models)
     width = tables.entry.shape[1]
-    rows = max(width, *(info.rows for info in infos))
+    rows = width + max(info.rows for info in infos)
     return Record(
         node={"dependent": (n, n)},
         payload={"xhat": (width,), "root": (width, width), "dependent": (width, width)},
@@ -309,6 +320,7 @@ def block_record(
             "tables": tables,
             "fusion": fusion_of(n, rows),
             "heard_x": np.zeros(width),
+            "weights": np.zeros((rows, width)),
             "heard_P": np.zeros((width, width)),
             "heard_D": np.zeros((width, width)),
             "late_x": np.zeros((1, n, 1)),

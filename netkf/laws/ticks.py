@@ -294,20 +294,23 @@ def largest_correlation(
 
     Products of two columns in units of their expected deviations (those that were seen would be far
     too small where events are rare) are averaged by Student's interval, with Bonferroni's
-    correction for all pairs. None with fewer than two columns of MIN_EVENTS expected events, or 100
-    rows.
+    correction for all pairs with variances in one row. None without such a pair of columns of
+    MIN_EVENTS expected events, or with fewer than 100 rows.
     """
     frequent = np.flatnonzero(variances[:, :MAX_CLOCKS].sum(axis=0) >= MIN_EVENTS)
     if len(frequent) < 2 or len(values) < 100:
         return None
     x, variance = values[:, frequent], variances[:, frequent]
     deviation = np.sqrt(variance)
-    correlations = x.T @ x / (deviation.T @ deviation)
-    upper = np.triu_indices(len(frequent), 1)
-    largest = int(np.argmax(np.abs(correlations[upper])))
-    a, b = int(upper[0][largest]), int(upper[1][largest])
+    apart = deviation.T @ deviation
+    # Links of a matching that are never up together have no products.
+    first, second = np.nonzero(np.triu(apart, 1))
+    if not len(first):
+        return None
+    largest = int(np.argmax(np.abs((x.T @ x)[first, second] / apart[first, second])))
+    a, b = int(first[largest]), int(second[largest])
     interval = correlation_of_columns(
-        x[:, a] * x[:, b], variance[:, a] * variance[:, b], level / len(upper[0])
+        x[:, a] * x[:, b], variance[:, a] * variance[:, b], level / len(first)
     )
     return deviation_interval(0.0, interval), (int(frequent[a]), int(frequent[b]))
 

@@ -230,6 +230,25 @@ def test_only_the_naive_update_is_overconfident(tmp_path: Path, estimates: str) 
         assert too_small == (settings.get("rule") == "naive"), (settings, ensemble)
 
 
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("text", [ROBOTS, CLOCKED], ids=["slots", "clocks"])
+def test_all_that_a_message_tells_is_used_at_once(tmp_path: Path, text: str, rule: str) -> None:
+    """The sender's error is in each of its readings of the receiver, and in its estimates."""
+    changes = {"filter__kind": "block-intersection", "filter__rule": rule}
+    one = load(text, tmp_path, **changes)
+    relative = as_table(one)["sensors"][1]
+    both = {"H": [[1.0], [1.0]], "R": [[0.3, 0.0], [0.0, 0.05]]}
+    parts = [{"H": [[1.0]], "R": [[R]]} for R in (0.3, 0.05)]
+    stacked, parted = (
+        one.replace({"sensors": [as_table(one)["sensors"][0], *({**relative, **p} for p in some)]})
+        for some in ([both], parts)
+    )
+    run = netkf.simulate(parted)
+    np.testing.assert_allclose(run.P, netkf.simulate(stacked).P, rtol=1e-9)
+    gap = np.linalg.eigvalsh(run.P - netkf.theory.error_covariance(parted, run))
+    assert (gap >= -1e-9).all() or rule == "naive"
+
+
 def test_tables_have_the_blocks_of_each_node(tmp_path: Path) -> None:
     scenario = load(ROBOTS, tmp_path, filter__estimates="own+neighbours")
     run = netkf.simulate(scenario)

@@ -242,3 +242,6 @@ def test_links_with_few_losses_state_no_error_that_they_could_not_find():
     assert np.isnan(largest_correlation(excess, variances, 1e-6)[0].detectable)
     assert largest_correlation(excess, variances, LEVEL)[0].detectable < 1.0
     assert largest_correlation(excess[:, :2], variances[:, :2] / 4.0, LEVEL) is None
+    # Links of which one is up at a time, as in a matching.
+    alternate = np.eye(2)[np.arange(len(excess)) % 2]
+    assert largest_correlation(excess[:, :2] * alternate, 9.0 * alternate, LEVEL) is None

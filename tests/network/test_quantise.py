@@ -83,7 +83,7 @@ def test_values_beyond_the_range_are_clipped_and_counted():
 
 def test_triangles_stay_triangles_and_symmetric_matrices_symmetric():
     encoder = Encoder(Quantisation(bits=5, range=4.0), np.random.default_rng(3))
-    root = np.array([[1.0, 0.0, 0.0], [0.5, 2.0, 0.0], [-1.0, 0.0, 3.0]])
+    root = np.array([[1.0, 0.0, 0.0], [0.5, 2.0, 0.0], [-1.0, 0.2, 3.0]])
     (lower, upper, both, count, name), _ = encoder.encode(
         (root, root.T, root @ root.T / 4.0, 7, "x")
     )
@@ -92,6 +92,18 @@ def test_triangles_stay_triangles_and_symmetric_matrices_symmetric():
     assert (upper[np.tril_indices(3, -1)] == 0.0).all()
     assert np.array_equal(both, both.T)
     assert (count, name) == (7, "x")
+
+
+def test_nothing_is_received_as_nothing(scenario_of):
+    """A node of push-sum that no mass has reached must not divide by the error of its weight."""
+    scenario = scenario_of(bits=30, filter_="icf", horizon=4.0).replace(
+        {
+            "filter": {"kind": "push-sum", "gamma": 1, "delta": 4.1},
+            "network.graph": {"kind": "path", "nodes": 3},
+        }
+    )
+    exact = netkf.simulate(scenario.replace({"network.quantise": None}))
+    np.testing.assert_allclose(netkf.simulate(scenario).P, exact.P, rtol=1e-4)
 
 
 def plain_run(slots, bits, limit, seed):
