@@ -54,7 +54,7 @@ def probe_times(scenario: Scenario) -> list[float]:
     """
     checked = check_times(scenario)
     count = min(MAX_POOLED, POOLED_ERRORS // errors_at_once(scenario))
-    even = np.linspace(0.0, checked[-1], max(count, 0) + 1)[1:].tolist()
+    even = scenario.time_grid.snap(np.linspace(0.0, checked[-1], max(count, 0) + 1)[1:]).tolist()
     if scenario.slotted:
         plant = scenario.slot_plant
         even = [plant.slot_time(max(1, round(time / plant.period))) for time in even]

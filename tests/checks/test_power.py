@@ -103,6 +103,15 @@ def test_runs_are_sampled_where_rows_look_and_often_enough(name):
     assert max_replayed(scenario) >= min(RUNS, 23_000 / errors)
 
 
+@pytest.mark.parametrize("horizon", [0.7, 3.1, 3.6, 3.9])
+def test_equal_instants_are_sampled_once(horizon):
+    """Shares of the horizon and even times meet: 0.125 of 3.6 s is three times 0.15 s."""
+    scenario = load_shipped("poisson_ring").replace({"horizon": horizon, "probe": horizon})
+    times = np.array(probe_times(scenario))
+    np.testing.assert_array_equal(times, scenario.time_grid.snap(times))
+    assert (np.diff(times) > 1e-9).all()
+
+
 @pytest.fixture(scope="module")
 def samples(ring):
     scenario, results = ring
