@@ -54,7 +54,7 @@ from netkf.theory.intermittent.averages import mean_covariance_bounds
 from netkf.theory.intermittent.riccati import steady_covariance
 from netkf.theory.intermittent.scalar_law import ScalarLaw, scalar_law
 from netkf.trace.run import Run
-from netkf.trace.schema import CODES
+from netkf.trace.schema import rows_of
 
 BOUND_TOLERANCE, SUPPORT_TOLERANCE = 1e-8, 1e-6
 """Relative to tr P: shortfall below the path without losses that rounding may cause in any case;
@@ -141,7 +141,7 @@ def _count_messages(scenario: Scenario, run: Run, kind: str, slots: int) -> np.n
     """Return how many readings have events of a ``kind`` on each direction in the first slots."""
     # In the log a message is sent by the node of its row, but delivered to it.
     sender, receiver = ("node", "peer") if kind == "send" else ("peer", "node")
-    rows = run.log[run.log["kind"] == CODES[kind]]
+    rows = rows_of(run.log, kind)
     rows = rows[scenario.slot_plant.slots_of(rows["t"]) < slots]
     counts = Counter(zip(rows[sender].tolist(), rows[receiver].tolist(), strict=True))
     return np.array([counts[pair] for pair in _heard_directions(scenario)], dtype=int)

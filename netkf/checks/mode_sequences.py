@@ -24,7 +24,7 @@ from netkf.checks.samples import RunSamples
 from netkf.linalg.arrays import FloatArray, block_diagonal, square_root
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
-from netkf.trace.schema import CODES
+from netkf.trace.schema import rows_of
 
 MAX_CHAINS, MIN_CHAINS = 20_000, 4_000
 """Limits on the number of simulated chains of a reference sample."""
@@ -201,7 +201,7 @@ def pair_sources(scenario: Scenario, run: Run, slots: int) -> np.ndarray:
     """Return the index (slots, N) of the node whose pair each node used in each slot of gossip."""
     index = scenario.topology.index  # index of each node id
     sources = np.tile(np.arange(len(index)), (slots, 1))
-    swaps = run.log[run.log["kind"] == CODES["swap"]]
+    swaps = rows_of(run.log, "swap")
     slot = scenario.slot_plant.slots_of(swaps["t"])
     in_time = slot < slots
     nodes, peers = (np.array([index[k] for k in swaps[name].tolist()]) for name in ("node", "peer"))
@@ -273,7 +273,7 @@ def find_arrivals(scenario: Scenario, run: Run | None, slots: int) -> Arrivals:
     """Return the readings that sampled nodes used in the first ``slots``; all without a run."""
     arrived: dict[tuple[int, int], list[int]] = {}
     if run is not None:
-        delivered = run.log[run.log["kind"] == CODES["deliver"]]
+        delivered = rows_of(run.log, "deliver")
         # A reading belongs to the slot in which it was sent, not to that of its arrival.
         slot = scenario.slot_plant.slots_of(delivered["t"] - np.nan_to_num(delivered["age"]))
         columns = (slot.tolist(), delivered["node"].tolist(), delivered["peer"].tolist())

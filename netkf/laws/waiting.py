@@ -94,10 +94,11 @@ def correlate_neighbours(ranks: Ranks, first: np.ndarray) -> FloatArray:
     Pairs with nan, or with the ``first`` (K,) of a series, are left out; a rank beyond the known
     parts counts as the mean of what is beyond.
     """
-    limit = np.clip(ranks.known / CELLS, 1e-12, 1.0 - 1e-12)
-    density = np.exp(-0.5 * scipy.special.ndtri(limit) ** 2) / math.sqrt(2.0 * math.pi)
+    limits = np.clip(np.arange(CELLS + 1) / CELLS, 1e-12, 1.0 - 1e-12)
+    density = np.exp(-0.5 * scipy.special.ndtri(limits) ** 2) / math.sqrt(2.0 * math.pi)
+    means = density / (1.0 - limits)
     seen = scipy.special.ndtri(np.clip(ranks.rank, 1e-12, 1.0 - 1e-12))
-    normal = np.where(ranks.is_beyond, density / (1.0 - limit), seen)
+    normal = np.where(ranks.is_beyond, means[np.nan_to_num(ranks.known).astype(np.int64)], seen)
     pairs = ~first[1:] & np.isfinite(normal[1:]) & np.isfinite(normal[:-1])
     u, v = normal[1:][pairs], normal[:-1][pairs]
     return np.array([u @ v, 0.5 * (u @ u + v @ v), float(len(u))])

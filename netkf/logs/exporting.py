@@ -26,7 +26,7 @@ from netkf.scenario.writing import resolve_defaults, to_toml
 from netkf.theory.common.arrivals import with_last_exchanges
 from netkf.trace.messages import LOST, UNDER_WAY, join_messages
 from netkf.trace.run import Run
-from netkf.trace.schema import CODES
+from netkf.trace.schema import rows_of
 
 
 def export_recorded(run: Run, out: str | Path) -> tuple[Path, ...]:
@@ -177,7 +177,7 @@ def export_log(run: Run, out: str | Path) -> tuple[Path, ...]:
     activation = scenario.network.activation
     right = not scenario.network.clocks
     if right and isinstance(activation, LinkClock) and activation.at != "readings":
-        rows = run.log[run.log["kind"] == CODES["tick"]]
+        rows = rows_of(run.log, "tick")
         stamps = [scenario.time.stamps.text(t) for t in rows["t"].tolist()]
         ticks = pd.DataFrame({"t": stamps, "node": [names[i] for i in rows["node"].tolist()]})
         if activation.at != "nodes":

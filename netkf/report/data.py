@@ -20,7 +20,7 @@ from netkf.runs.stored import StoredRun
 from netkf.runs.summary import nees_bounds
 from netkf.studies.consistency import judged_blocks
 from netkf.trace.nees import errors
-from netkf.trace.schema import CODES
+from netkf.trace.schema import CODES, rows_of
 
 BINS = 60
 """Equal intervals of a run in which traffic is counted."""
@@ -294,8 +294,7 @@ def _event_columns(
     run: StoredRun, kinds: tuple[str, ...], max_events: int, packer: Packer
 ) -> dict[str, Any]:
     """Return the events of ``kinds`` for the live views, every k-th if more than ``max_events``."""
-    codes = [CODES[kind] for kind in kinds]
-    rows = run.log[np.isin(run.log["kind"], codes)]
+    rows = rows_of(run.log, *kinds)
     step = max(1, -(-len(rows) // max(1, max_events)))
     events = rows[::step]
     columns = {

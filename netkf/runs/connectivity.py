@@ -18,7 +18,7 @@ from netkf.network.recorded import RecordedLoss
 from netkf.network.spectra import connected_parts
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import Sink
-from netkf.trace.schema import CODES, EVENT
+from netkf.trace.schema import CODES, join_rows, rows_of
 
 RECENT = 5.0
 """Where messages are recorded a link is up while the newest one heard is no older than so many mean
@@ -75,7 +75,7 @@ class ConnectivitySink(Sink):
         """Keep the messages heard, where they say which links are up."""
         if self.by_messages:
             self._sent += int((rows["kind"] == CODES["send"]).sum())
-            self._heard.append(rows[rows["kind"] == CODES["deliver"]])
+            self._heard.append(rows_of(rows, "deliver"))
 
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
@@ -165,7 +165,7 @@ class ConnectivitySink(Sink):
 
     def newest_heard(self, t: FloatArray) -> Iterator[FloatArray]:
         """Yield for each directed link when its newest message heard was sent (T,), 0 without."""
-        rows, size = np.concatenate([np.empty(0, EVENT), *self._heard]), len(self._scenario.nodes)
+        rows, size = join_rows(self._heard), len(self._scenario.nodes)
         sender, receiver = (
             np.searchsorted(self._scenario.nodes, rows[n]) for n in ("peer", "node")
         )

@@ -44,7 +44,7 @@ from netkf.runs.transmissions import SentPerLink
 from netkf.scenario.plugins import describe_error
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.usage import record_usage
-from netkf.trace.recorder import Recorder, Sink
+from netkf.trace.recorder import Fingerprint, Recorder, Sink
 from netkf.trace.run import Run
 
 ENDINGS = {"failed": "failed", "interrupted": "was interrupted"}
@@ -128,7 +128,7 @@ def run_to_directory(
         if explained is error:
             raise
         raise explained from error
-    totals = _event_totals(recorder.total, recorder.fingerprint, recorder.stats)
+    totals = _event_totals(recorder.total, str(output.fingerprint), recorder.stats)
     output.manifest.write(status, totals, is_complete, names=run_file_names(scenario))
     return completed
 
@@ -174,12 +174,13 @@ class _Output:
     links: list[SentPerLink]
     network: list[NetworkSink]
     manifest: Manifest
+    fingerprint: Fingerprint
 
     @property
     def sinks(self) -> list[Sink]:
         """All sinks, which receive the events and samples of the run."""
         tables = [] if self.tables is None else [self.tables]
-        return [self.samples, *tables, *self.links, *self.network]
+        return [self.samples, self.fingerprint, *tables, *self.links, *self.network]
 
     def close_tables(self) -> None:
         """Finish the Parquet tables, if the run has any; raises WriteError."""
@@ -240,6 +241,7 @@ def _create_output(
         links=[SentPerLink()] if is_recorded else [],
         network=[NetworkSink(scenario, seed, replica, samples.transmissions)] if wanted else [],
         manifest=manifest,
+        fingerprint=Fingerprint(),
     )
 
 
@@ -261,7 +263,7 @@ def _keep_partial_results(
             output.write_summary(unknown, recorder.count, recorder.sums, status)
     output.manifest.write(
         status,
-        _event_totals(recorder.total, recorder.fingerprint, recorder.stats),
+        _event_totals(recorder.total, str(output.fingerprint), recorder.stats),
         is_complete,
         error,
     )

@@ -15,7 +15,7 @@ from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import MemorySink, Recorder, Sink
 from netkf.trace.run import Run
-from netkf.trace.schema import EVENT
+from netkf.trace.schema import join_rows
 
 ENGINES = ("auto", "simpy", "compiled")
 
@@ -106,12 +106,11 @@ def collect_run(
         xhat=xhat,
         P=P,
         error=error,
-        log=np.concatenate([np.empty(0, dtype=EVENT), *memory.blocks]),
+        log=join_rows(memory.blocks),
         seed=seed,
         replica=replica,
         engine=engine,
         status=status,
-        fingerprint=recorder.fingerprint,
         sums=recorder.sums,
         truth_known=scenario.plant.truth_known,
         exact_errors=recorder.exact_errors,

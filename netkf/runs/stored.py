@@ -108,6 +108,13 @@ class StoredRun(WithPromises, Run):
         return self.stored
 
     @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 of the events, as the run wrote it; an ensemble writes that of its first run."""
+        if self.replica == int(self.manifest.get("replica", 0)):
+            return str(self.manifest.get("fingerprint", ""))
+        return super().fingerprint
+
+    @cached_property
     def sq_error(self) -> FloatArray:
         """Squared errors (T, N) as the run wrote them; nan without ground truth."""
         return self._column("sq_error")
@@ -156,8 +163,6 @@ def read_run(
     require_form(conserved, {}, "conserved")
     for name, entry in conserved.items():
         require_form(entry, {"exact": NUMBER, "total": NUMBER}, f"conserved.{name}")
-    # The fingerprint of an ensemble is that of its first run.
-    has_fingerprint = is_single_run or replica == 0
     ended = "diverged" if (log["kind"] == CODES["diverged"]).any() else "complete"
     return StoredRun(
         **arrays,
@@ -167,7 +172,6 @@ def read_run(
         replica=replica,
         engine=str(manifest.get("engine", "")),
         status=str(manifest["status"]) if is_single_run else ended,
-        fingerprint=str(manifest.get("fingerprint", "")) if has_fingerprint else "",
         sums={name: (entry["exact"], entry["total"]) for name, entry in conserved.items()},
         truth_known=scenario.plant.truth_known,
         stats=dict(manifest.get("simpy", {})) if is_single_run else {},

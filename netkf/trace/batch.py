@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
-from netkf.trace.recorder import Recorder, Sink
+from netkf.trace.recorder import Fingerprint, Recorder, Sink
 from netkf.trace.schema import CODES, KINDS
 
 COMPLETE, DIVERGED = "complete", "diverged"
@@ -81,10 +81,12 @@ class BatchSink(Sink):
         self._counts = np.zeros((len(replicas), len(KINDS)), dtype=np.int64)
         self._status: list[str] = []
         self._sums: list[dict[str, tuple[float, float]]] = []
-        self._fingerprint = ""
+        self._hash, self._fingerprint = Fingerprint(), ""
 
     def events(self, rows: np.ndarray) -> None:
-        """Ignore the EVENT ``rows`` (K,): the recorder counts them."""
+        """Add the EVENT ``rows`` (K,) of the first run to its fingerprint; others are counted."""
+        if not self._status:
+            self._hash.events(rows)
 
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
@@ -104,8 +106,8 @@ class BatchSink(Sink):
         ("complete" or "diverged"); later samples belong to the next replica (number of a run).
         """
         # A batch has the fingerprint of its first run only.
-        if not self._status:
-            self._fingerprint = recorder.fingerprint
+        if not self._status and not recorder.counts_only:
+            self._fingerprint = str(self._hash)
         self._counts[len(self._status)] = recorder.counts
         self._status.append(status)
         self._sums.append(recorder.sums)

@@ -2,8 +2,8 @@
 
 Engines append events to a list as tuples, which is passed on in blocks, or hand over blocks of
 events; samples arrive one or several at a time. Both go to sinks, which keep them in memory or
-write them to files. From the first long block on, a thread calls the sinks and updates the
-fingerprint, in order, while the engine continues.
+write them to files. From the first long block on, a thread calls the sinks, in order, while the
+engine continues.
 """
 
 from __future__ import annotations
@@ -72,19 +72,37 @@ class MemorySink(Sink):
         self.samples.append((t, x, xhat, P, error))
 
 
+class Fingerprint(Sink):
+    """A sink that only hashes the events: SHA-256, which does not depend on the blocks."""
+
+    thread_safe: ClassVar[bool] = True
+
+    def __init__(self) -> None:
+        self._hash = hashlib.sha256()
+
+    def events(self, rows: np.ndarray) -> None:
+        """Add the EVENT ``rows`` (K,) to the hash."""
+        self._hash.update(rows.data)
+
+    def states(self, *samples: FloatArray) -> None:
+        """Ignore samples."""
+
+    def __str__(self) -> str:
+        return self._hash.hexdigest()
+
+
 def _ignore(row: tuple[float, int, int, int, int, int, float]) -> None:
     """Discard an event, the tuple ``row`` that ``Recorder.append`` takes."""
 
 
 class Recorder:
-    """Takes events and samples from an engine, counts and fingerprints the events, and passes both
-    to sinks. With ``counts_only`` events are only counted: sinks get nothing but samples.
+    """Takes events and samples from an engine, counts the events, and passes both to sinks, with
+    ``counts_only`` only the samples.
     """
 
     def __init__(self, sinks: Sequence[Sink], counts_only: bool = False) -> None:
         self._sinks, self.counts_only = tuple(sinks), counts_only
         self._rows: list[tuple[float, int, int, int, int, int, float]] = []
-        self._hash = hashlib.sha256()
         self._counts = np.zeros(len(KINDS), dtype=np.int64)
         self._thread: ThreadPoolExecutor | None = None
         self._pending: list[Future[None]] = []
@@ -193,9 +211,8 @@ class Recorder:
         self._counts += np.bincount(kinds, minlength=len(KINDS))
 
     def _pass_on(self, rows: np.ndarray) -> None:
-        """Count and fingerprint a block of EVENT ``rows`` (K,), and pass it to all sinks."""
+        """Count a block of EVENT ``rows`` (K,), and pass it to all sinks."""
         self._count(rows["kind"])
-        self._hash.update(rows.data)
         for sink in self._sinks:
             sink.events(rows)
 
@@ -237,10 +254,3 @@ class Recorder:
     def total(self) -> int:
         """The number of flushed events."""
         return int(self._counts.sum())
-
-    @property
-    def fingerprint(self) -> str:
-        """SHA-256 of the flushed events, which does not depend on the blocks; empty if
-        ``counts_only``.
-        """
-        return "" if self.counts_only else self._hash.hexdigest()

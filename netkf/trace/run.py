@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -53,7 +54,6 @@ class Run(NotebookTable):
     replica: int
     engine: str
     status: str
-    fingerprint: str
     sums: dict[str, tuple[float, float]] = field(default_factory=dict)
     truth_known: bool = True
     exact_errors: bool = False
@@ -96,6 +96,11 @@ class Run(NotebookTable):
     def nees(self) -> FloatArray:
         """The NEES (T, N) of the samples, nan where P is singular or the truth is unknown."""
         return errors(self.error, self.P)[1]
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 of ``log``."""
+        return hashlib.sha256(self.log.tobytes()).hexdigest()
 
     @cached_property
     def rounding(self) -> FloatArray:

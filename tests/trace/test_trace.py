@@ -93,8 +93,8 @@ def block(number, length):
 
 
 def test_long_blocks_are_kept_by_one_other_thread_in_their_order():
-    sink, plain = Watched(), hashlib.sha256()
-    record = recorder.Recorder([sink])
+    sink, plain, fingerprint = Watched(), hashlib.sha256(), recorder.Fingerprint()
+    record = recorder.Recorder([sink, fingerprint])
     here = threading.current_thread()
     for number in range(6):
         rows = block(number, recorder.LONG if number in (2, 4) else 5)
@@ -104,7 +104,7 @@ def test_long_blocks_are_kept_by_one_other_thread_in_their_order():
             float(number), *(np.zeros(shape) for shape in ((1,), (2, 1), (2, 1, 1), (2, 1)))
         )
     record.flush()
-    assert record.fingerprint == plain.hexdigest()
+    assert str(fingerprint) == plain.hexdigest()
     assert record.total == 2 * recorder.LONG + 20
     expected = [(kind, number) for number in range(6) for kind in ("events", "states")]
     assert [call[1:] for call in sink.calls] == expected

@@ -23,7 +23,7 @@ from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.random_links import has_constant_losses
 from netkf.trace.run import Run
-from netkf.trace.schema import CODES
+from netkf.trace.schema import rows_of
 
 NO_CLOCKS = ClockGroup((), np.empty(0), (), ())
 MAX_BASE = 1 << 31
@@ -86,7 +86,7 @@ def ticks_of(scenario: Scenario, run: Run) -> TickCounts | None:
     if not group.entities:
         return None
     clock: Any = scenario.network.activation
-    rows = run.log[run.log["kind"] == CODES["tick"]]
+    rows = rows_of(run.log, "tick")
     columns = [rows[name] for name in (("node",) if clock.at == "nodes" else ("node", "peer"))]
     if clock.at == "links":
         # Both nodes share the clock of a link, whose entity has the smaller id first.
@@ -193,7 +193,7 @@ def _redraws_links(scenario: Scenario) -> bool:
 def losses_of(scenario: Scenario, run: Run) -> LossCounts | None:
     """Return counts of sent and lost messages by window and direction; None without links."""
     directions, log = scenario.topology.directions, run.log
-    sends, losses = (log[log["kind"] == CODES[kind]] for kind in ("send", "lost"))
+    sends, losses = (rows_of(log, kind) for kind in ("send", "lost"))
     if not directions:
         return None
     size, number = len(directions), losses["message"]
@@ -255,7 +255,7 @@ def pairs_of(scenario: Scenario, run: Run) -> PairCounts | None:
     if not isinstance(scenario.network.activation, Matching):
         return None
     links = {link: k for k, link in enumerate(scenario.topology.links)}
-    rows = run.log[run.log["kind"] == CODES["tick"]]
+    rows = rows_of(run.log, "tick")
     slots = scenario.slot_plant.slots_of(rows["t"])
     ids = zip(rows["node"].tolist(), rows["peer"].tolist(), strict=True)
     link_of_row = np.array([links[min(e), max(e)] for e in ids], dtype=np.int64)
@@ -284,7 +284,7 @@ def delays_of(scenario: Scenario, run: Run) -> DelayCounts | None:
     not arrived when the run ends take longer than that.
     """
     (fixed, law), count = stated_delay(scenario), len(scenario.topology.directions)
-    rows = run.log[np.isin(run.log["kind"], (CODES["deliver"], CODES["late"]))]
+    rows = rows_of(run.log, "deliver", "late")
     if not count or (fixed is None and law is None):
         return None
     if fixed is not None:
@@ -298,7 +298,7 @@ def _follow_messages(
 ) -> tuple[FloatArray, IntArray, FloatArray]:
     """Return times of sending, directions and ages (K,) of messages that are not lost."""
     log, law = run.log, loss_law(scenario)
-    sends, losses = (log[log["kind"] == CODES[kind]] for kind in ("send", "lost"))
+    sends, losses = (rows_of(log, kind) for kind in ("send", "lost"))
     width = int(sends["message"].max(initial=0)) + 1
 
     def keys(rows: np.ndarray, sender: str, receiver: str) -> IntArray:

@@ -43,6 +43,8 @@ ENOUGH_TICKS, MAX_DRAWN, MAX_DRAWN_TICKS, DRAWN_PER_RUN = 80_000, 20_000, 3e6, 4
 """Ticks of one clock that reveal an error of WANTED_RATE. Limits on the extra replicas in which
 only the clocks are drawn: clocks times replicas, ticks of all clocks, and replicas for each run.
 """
+MIN_DRAWN_SHARE = 0.1
+"""Share of the runs below which so few extra replicas would hardly narrow the intervals."""
 Test = Callable[[PartSamples, float], Finding]
 """A test of a row: a function of the samples of all runs and a level."""
 Draw = Callable[[Scenario, int, int], np.ndarray]
@@ -97,7 +99,7 @@ def _number_drawn(group: ClockGroup, horizon: float, runs: float) -> int:
         int(MAX_DRAWN / len(expected)),
         int(MAX_DRAWN_TICKS / expected.sum()),
     )
-    return int(max(further, 0))
+    return int(further) if further >= MIN_DRAWN_SHARE * runs else 0
 
 
 def _check_rates(clocks: Clocks, samples: PartSamples, level: float) -> Finding:

@@ -22,7 +22,7 @@ from netkf.plants.recorded import RecordedSensor
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
-from netkf.trace.schema import CODES, KINDS
+from netkf.trace.schema import CODES, KINDS, rows_of
 
 SENSE, TICK, SEND, DELIVER, LOST, LATE, ABSORB, SWAP, ROUND, STOP, TRANSMIT = (
     CODES[kind]
@@ -56,13 +56,13 @@ def event_fault(scenario: Scenario, run: Run) -> str:
     """Return one line about the first fault of the record of a run's events; empty without one."""
     # Links are looked at at ticks and at samples, before or after other events of the instant;
     # gates and quantisers stand between the events of several nodes.
-    others = ("link", "crash", "restart", "join", "leave", "refuse", "clip")
-    log = run.log[~np.isin(run.log["kind"], [CODES[kind] for kind in others])]
+    others = {"link", "crash", "restart", "join", "leave", "refuse", "clip"}
     rules = [_ordered, _numbered, _decided, _absorbed]
     rules += [_read_in_slots, _sent_in_slots] if scenario.slotted else [_read, _ticked, _caused]
     if scenario.network.lives:
         # What is read, sent, lost and absorbed depends on who is up.
-        log, rules = log[log["kind"] != LOST], rules[:2]
+        others, rules = others | {"lost"}, rules[:2]
+    log = rows_of(run.log, *set(KINDS) - others)
     for rule in rules:
         for fault in rule(scenario, run, log):
             return fault

@@ -20,7 +20,7 @@ from netkf.runs.stored import MANIFEST_FORM, StoredRun, read_checked_document, r
 from netkf.scenario.scenario import Scenario
 from netkf.trace.nees import traces, without_padding
 from netkf.trace.run import Run
-from netkf.trace.schema import CODES
+from netkf.trace.schema import CODES, rows_of
 
 FILE_TOLERANCE = 1e-9
 """Relative difference above which an average or a column is not that of the run."""
@@ -139,7 +139,7 @@ def _summary_fault(run: Run, stored: StoredRun) -> str:
 
 
 def _transmissions(run: Run) -> dict[int, int]:
-    rows = run.log[np.isin(run.log["kind"], (CODES["send"], CODES["transmit"], CODES["round"]))]
+    rows = rows_of(run.log, "send", "transmit", "round")
     sends = rows["kind"] == CODES["send"]
     broadcasts = rows["node"][rows["kind"] == CODES["transmit"]]
     if (rows["phase"][sends] >= 0).any():

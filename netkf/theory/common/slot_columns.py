@@ -30,7 +30,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.theory.common.columns import ErrorColumns, padded
 from netkf.theory.common.observations import Observation, slot_observations
 from netkf.trace.run import Run
-from netkf.trace.schema import CODES
+from netkf.trace.schema import rows_of
 
 ZERO, MEAN, NOISE = range(3)
 """The first columns: no noise at all, whose entries are those that do not depend on noise; the
@@ -290,7 +290,7 @@ def _arrivals(
 ) -> dict[int, np.ndarray]:
     """Return by slot which messages were used, (E, W) by exchange and directed link."""
     log, index = run.log, setup.index_of_direction
-    sends, delivers = (log[log["kind"] == CODES[kind]] for kind in ("send", "deliver"))
+    sends, delivers = (rows_of(log, kind) for kind in ("send", "deliver"))
     slots, phases = scenario.slot_plant.slots_of(sends["t"]), np.maximum(sends["phase"], 0)
     first_step = {phase: setup.phases.index(phase) for phase in set(setup.phases)}
     counts: dict[tuple[int, int, int], int] = {}

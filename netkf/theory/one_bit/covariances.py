@@ -11,7 +11,7 @@ from netkf.linalg.arrays import ArrayLike, FloatArray, symmetric
 from netkf.scenario.scenario import Scenario
 from netkf.theory.intermittent.riccati import check_system, lyapunov_step
 from netkf.trace.run import Run
-from netkf.trace.schema import CODES
+from netkf.trace.schema import rows_of
 
 
 def one_bit_update(P: ArrayLike, H: ArrayLike, R: ArrayLike) -> FloatArray:
@@ -56,11 +56,11 @@ def bit_covariances(scenario: Scenario, run: Run) -> FloatArray:
 def _used_bits(scenario: Scenario, run: Run) -> dict[int, list[tuple[int, int]]]:
     """Return by slot the pairs (receiver, sender) of used bits; a sender uses its own."""
     bits: dict[int, set[tuple[int, int]]] = {}
-    rows = run.log[run.log["kind"] == CODES["deliver"]]
+    rows = rows_of(run.log, "deliver")
     slots = scenario.slot_plant.slots_of(rows["t"])
     for slot, node, peer in zip(slots, rows["node"].tolist(), rows["peer"].tolist(), strict=True):
         bits.setdefault(int(slot), set()).add((node, peer))
-    rows = run.log[run.log["kind"] == CODES["send"]]
+    rows = rows_of(run.log, "send")
     slots = scenario.slot_plant.slots_of(rows["t"])
     for slot, node in zip(slots, rows["node"].tolist(), strict=True):
         bits.setdefault(int(slot), set()).add((node, node))

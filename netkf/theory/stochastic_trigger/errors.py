@@ -31,7 +31,7 @@ from netkf.theory.common.slot_columns import SlotColumns
 from netkf.theory.intermittent.riccati import check_system, lyapunov_step
 from netkf.theory.numerics.matrices import as_covariance
 from netkf.trace.run import Run
-from netkf.trace.schema import CODES
+from netkf.trace.schema import rows_of
 
 UNHEARD = "who misses a message takes it for silence, and the log does not show unheard decisions"
 """Why nothing is said of networks in which some decision is not heard by all."""
@@ -55,7 +55,7 @@ def start_equal(scenario: Scenario) -> bool:
 
 def decisions(scenario: Scenario, run: Run) -> Decisions:
     """Return the pairs (slot, index of the node) of all messages sent in a run."""
-    index, rows = scenario.topology.index, run.log[run.log["kind"] == CODES["send"]]
+    index, rows = scenario.topology.index, rows_of(run.log, "send")
     slots = scenario.slot_plant.slots_of(rows["t"])
     return {(slot, index[node]) for slot, node in zip(slots, rows["node"].tolist(), strict=True)}
 
