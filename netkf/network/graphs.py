@@ -112,42 +112,52 @@ class Topology:
         return {node: k for k, node in enumerate(self.nodes)}
 
     @cached_property
+    def ends(self) -> np.ndarray:
+        """The indices (L, 2) in ``nodes`` of the ends of links."""
+        ends = [(self.index[i], self.index[j]) for i, j in self.links]
+        return np.array(ends, dtype=np.int64).reshape(-1, 2)
+
+    @cached_property
     def degrees(self) -> dict[int, int]:
         """The number of links at each node (of incoming ones in a directed graph)."""
-        degrees = dict.fromkeys(self.nodes, 0)
-        for i, j in self.links:
-            degrees[j] += 1
-            if not self.directed:
-                degrees[i] += 1
-        return degrees
+        heard = self.ends[:, 1] if self.directed else self.ends.reshape(-1)
+        counts = np.bincount(heard, minlength=len(self.nodes))
+        return dict(zip(self.nodes, counts.tolist(), strict=True))
 
     @cached_property
     def laplacian_radius(self) -> float:
         """The spectral radius rho(L) of the Laplacian L of all links."""
-        ends = np.array([(self.index[i], self.index[j]) for i, j in self.links])
         degrees = np.array([float(self.degrees[node]) for node in self.nodes])
-        return largest_laplacian_eigenvalue(degrees, ends)
+        return largest_laplacian_eigenvalue(degrees, self.ends)
 
     @cached_property
     def directions(self) -> tuple[Link, ...]:
         """The sorted pairs (sender, receiver): both directions of each link unless directed."""
-        back = () if self.directed else tuple((j, i) for i, j in self.links)
-        return tuple(sorted((*self.links, *back)))
+        pairs = self._direction_ends.tolist()
+        return tuple((self.nodes[i], self.nodes[j]) for i, j in pairs)
+
+    @property
+    def _direction_ends(self) -> np.ndarray:
+        """The indices (D, 2) in ``nodes``, which are in increasing order, of ``directions``."""
+        both = self.ends if self.directed else np.concatenate([self.ends, self.ends[:, ::-1]])
+        return both[np.lexsort((both[:, 1], both[:, 0]))]
 
     @cached_property
     def _receivers(self) -> dict[int, tuple[int, ...]]:
-        return self._ends(0)
+        return self._peers(0)
 
     @cached_property
     def _senders(self) -> dict[int, tuple[int, ...]]:
-        return self._ends(1)
+        return self._peers(1)
 
-    def _ends(self, end: int) -> dict[int, tuple[int, ...]]:
+    def _peers(self, end: int) -> dict[int, tuple[int, ...]]:
         """Return the peers of each node as ``end`` of directions: 0 sender, 1 receiver."""
-        peers: dict[int, list[int]] = {node: [] for node in self.nodes}
-        for direction in self.directions:
-            peers[direction[end]].append(direction[1 - end])
-        return {node: tuple(sorted(ids)) for node, ids in peers.items()}
+        pairs = self._direction_ends
+        pairs = pairs[np.argsort(pairs[:, end], kind="stable")]
+        firsts = np.searchsorted(pairs[:, end], np.arange(len(self.nodes) + 1)).tolist()
+        ids = [self.nodes[k] for k in pairs[:, 1 - end].tolist()]
+        spans = itertools.pairwise(firsts)
+        return {node: tuple(ids[a:b]) for node, (a, b) in zip(self.nodes, spans, strict=True)}
 
     def receivers(self, node: int) -> tuple[int, ...]:
         """Return the ids of the nodes that may hear ``node``, in increasing order."""
@@ -160,19 +170,20 @@ class Topology:
     @cached_property
     def components(self) -> list[set[int]]:
         """The (weakly) connected components as sets of node ids, largest first."""
-        components, seen = [], set[int]()
-        for first in self.nodes:
-            if first in seen:
-                continue
-            component, waiting = {first}, [first]
-            while waiting:
-                node = waiting.pop()
-                found = {*self._receivers[node], *self._senders[node]} - component
-                component |= found
-                waiting.extend(found)
-            seen |= component
-            components.append(component)
-        return sorted(components, key=len, reverse=True)
+        part = list(range(len(self.nodes)))  # of each node a node before it in its component
+
+        def first(k: int) -> int:
+            while part[k] != k:
+                part[k] = k = part[part[k]]
+            return k
+
+        for i, j in self.ends.tolist():
+            a, b = first(i), first(j)
+            part[max(a, b)] = min(a, b)
+        components: dict[int, set[int]] = {}
+        for k, node in enumerate(self.nodes):
+            components.setdefault(first(k), set()).add(node)
+        return sorted(components.values(), key=len, reverse=True)
 
 
 def demand_in_graph(nodes: Sequence[int], topology: Topology) -> None:

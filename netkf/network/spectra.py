@@ -10,6 +10,10 @@ from netkf.linalg.arrays import FloatArray
 
 MAX_DENSE = 400
 """The largest number of nodes for which all eigenvalues are computed."""
+LOOK, RESIDUAL = 20, 1e-6
+"""Steps of the Lanczos method between two looks at its residual, and the relative residual at which
+it ends, which leaves 1e-10 in the eigenvalue.
+"""
 
 
 def largest_laplacian_eigenvalue(degrees: FloatArray, ends: np.ndarray) -> float:
@@ -27,17 +31,31 @@ def largest_laplacian_eigenvalue(degrees: FloatArray, ends: np.ndarray) -> float
 
 def _largest_sparse(degrees: FloatArray, ends: np.ndarray) -> float:
     import scipy.sparse
-    import scipy.sparse.linalg
+    from scipy.linalg import eigh_tridiagonal
 
     size = len(degrees)
     entries = np.full(len(ends), -1.0)
     upper = scipy.sparse.coo_array((entries, (ends[:, 0], ends[:, 1])), shape=(size, size))
     L = (upper + upper.T + scipy.sparse.diags_array(degrees)).tocsr()
-    # A fixed start: ARPACK's own would differ from call to call, and so would the last digits.
-    start = np.random.default_rng(0).standard_normal(size)
-    # A residual of 1e-6 leaves 1e-10 in the eigenvalue, in a quarter of the time of all digits.
-    values = scipy.sparse.linalg.eigsh(L, k=1, v0=start, tol=1e-6, return_eigenvectors=False)
-    return float(values[0])
+    # Lanczos without orthogonalisation, of which the largest eigenvalue has no need: ARPACK, with
+    # it and with restarts, took ten times as long.
+    before, v = np.zeros(size), np.random.default_rng(0).standard_normal(size)
+    v /= np.linalg.norm(v)
+    diagonal, beside, largest = [], [0.0], 0.0
+    for k in range(size):
+        w = L @ v - beside[-1] * before
+        diagonal.append(float(v @ w))
+        w -= diagonal[-1] * v
+        beside.append(float(np.linalg.norm(w)))
+        if k % LOOK == LOOK - 1 or k == size - 1 or beside[-1] == 0.0:
+            values, vectors = eigh_tridiagonal(
+                diagonal, beside[1:-1], select="i", select_range=(k, k)
+            )
+            largest = float(values[0])
+            if beside[-1] * abs(vectors[-1, 0]) <= RESIDUAL * largest:
+                break
+        before, v = v, w / beside[-1]
+    return largest
 
 
 def connected_parts(graph: Any, connection: Literal["strong", "weak"]) -> tuple[int, np.ndarray]:

@@ -113,7 +113,11 @@ def json_text(value: Any, margin: str = "\n") -> str:
     inner = margin + "  "
     items = value.values() if isinstance(value, dict) else value
     if not any(isinstance(item, (dict, list, tuple)) for item in items):
-        text = json.JSONEncoder(separators=("," + inner, ": ")).encode(to_json_value(value))
+        encoder = json.JSONEncoder(separators=("," + inner, ": "), allow_nan=False)
+        try:
+            text = encoder.encode(value)
+        except (TypeError, ValueError):  # numbers of numpy, or ones that are not finite
+            text = encoder.encode(to_json_value(value))
         return text[0] + inner + text[1:-1] + margin + text[-1]
     if isinstance(value, dict):
         entries = (

@@ -138,12 +138,15 @@ class NetworkSink(Sink):
         self.connectivity.finish()
         found[:, 2] = self.connectivity.shares()
         radio, energy = scenario.network.radio or Radio(), scenario.network.energy or Energy()
-        for k, node in enumerate(scenario.nodes):
-            found[k, 3:] = 0.0
-            for phase, count in self._transmissions.by_phase(node).items():
-                size = scenario.message_size(node, phase)
-                spent = _joules(energy, size, radio.frames(size))
-                found[k, 3:] += count * np.array([1.0, size, spent])
+        found[:-1, 3:] = 0.0
+        for phase, counts in self._transmissions.by_phase(scenario.nodes):
+            sizes = [
+                scenario.message_size(node, phase) if count else 0.0
+                for node, count in zip(scenario.nodes, counts, strict=True)
+            ]
+            spent = {size: _joules(energy, size, radio.frames(size)) for size in set(sizes)}
+            costs = [(1.0, size, spent[size]) for size in sizes]
+            found[:-1, 3:] += np.array(counts)[:, None] * np.array(costs)
         found[-1, 3:] = found[:-1, 3:].sum(axis=0)
         if scenario.network.energy is None:
             found[:, 5] = np.nan

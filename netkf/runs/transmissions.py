@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -70,13 +71,12 @@ class Transmissions:
 
     def count_for(self, node: int) -> int:
         """Return the number of transmissions of a node."""
-        return sum(self.by_phase(node).values())
+        return sum(counter[node, phase] for phase, counter in self._counters)
 
-    def by_phase(self, node: int) -> dict[int, int]:
-        """Return the number of transmissions of a node by exchange of the slot, -1 under clocks."""
-        return {
-            phase: counter[node, phase] for phase, counter in self._counters if counter[node, phase]
-        }
+    def by_phase(self, nodes: Sequence[int]) -> Iterator[tuple[int, list[int]]]:
+        """Yield each exchange of the slot, -1 under clocks, and the transmissions of ``nodes``."""
+        for phase, counter in self._counters:
+            yield phase, [counter[node, phase] for node in nodes]
 
     @property
     def total(self) -> int:

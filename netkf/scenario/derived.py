@@ -314,11 +314,7 @@ class DerivedScenario(ScenarioModel):
         total_information = np.zeros((self.plant.n, self.plant.n))
         for information in self.informations:
             total_information = total_information + information
-        receiver_counts = dict.fromkeys(self.nodes, 0)
-        senders: dict[int, list[int]] = {node: [] for node in self.nodes}
-        for sender, receiver in self.topology.directions:
-            receiver_counts[sender] += 1
-            senders[receiver].append(sender)
+        senders, receivers = self.topology.senders, self.topology.receivers
         max_delay = 0.0 if self.slotted else self.longest_delay
         degrees, own_weights, network = self.topology.degrees, self.own_weights, self._network_info
         rows = [
@@ -332,11 +328,11 @@ class DerivedScenario(ScenarioModel):
         places = dict(zip(self.nodes, map(self._own_places, range(len(self.nodes))), strict=True))
         return tuple(
             NodeInfo(
-                node, degrees[node], receiver_counts[node], len(self.nodes), own_weights[node],
-                total_information, max_delay, k, tuple(sorted(senders[node])), network, most_rows,
+                node, degrees[node], len(receivers(node)), len(self.nodes), own_weights[node],
+                total_information, max_delay, k, senders(node), network, most_rows,
                 self._own_sensors(k, sampled.get(node, ())), places[node],
                 self._is_alone(k, counts), whole,
-                tuple(places[i] for i in sorted(senders[node])),
+                tuple(places[i] for i in senders(node)),
             )
             for k, node in enumerate(self.nodes)
         )  # fmt: skip
@@ -842,11 +838,18 @@ class DerivedScenario(ScenarioModel):
         weights, topology = self._link_weights, self.topology
         if weights.matrix is not None:
             return float(weights.matrix[topology.index[sender], topology.index[receiver]])
-        weight: Any = weights.of(topology.degrees[receiver], topology.degrees[sender])
-        if not isinstance(weight, Real):
-            where = f"{type(self.node_filter).__name__}.link_weights.of"
-            raise ContractError(f"{where} must return a number, not {quote(weight)}")
-        return float(weight)
+        degrees = topology.degrees[receiver], topology.degrees[sender]
+        if degrees not in self._weights_by_degree:
+            weight: Any = weights.of(*degrees)
+            if not isinstance(weight, Real):
+                where = f"{type(self.node_filter).__name__}.link_weights.of"
+                raise ContractError(f"{where} must return a number, not {quote(weight)}")
+            self._weights_by_degree[degrees] = float(weight)
+        return self._weights_by_degree[degrees]
+
+    @cached_property
+    def _weights_by_degree(self) -> dict[tuple[int, int], float]:
+        return {}
 
     @cached_property
     def _link_weights(self) -> Weights:
@@ -894,13 +897,15 @@ def _shared(
 ) -> tuple[Made, ...]:
     """Return ``make(H, R)`` for each of many (H, R), made once for equal ones."""
     made: dict[tuple[bytes, bytes], Made] = {}
-    results = []
-    for H, R in stacks:
-        key = H.tobytes(), R.tobytes()
-        if key not in made:
-            made[key] = make(H, R)
-        results.append(made[key])
-    return tuple(results)
+    of_objects: dict[tuple[int, int], Made] = {}
+    pairs = list(stacks)  # which keeps them, and their ids
+    for H, R in pairs:
+        if (id(H), id(R)) not in of_objects:
+            key = H.tobytes(), R.tobytes()
+            if key not in made:
+                made[key] = make(H, R)
+            of_objects[id(H), id(R)] = made[key]
+    return tuple(of_objects[id(H), id(R)] for H, R in pairs)
 
 
 def _undriven(plant: Any) -> Any:

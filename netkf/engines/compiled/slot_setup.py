@@ -80,8 +80,7 @@ class SlotSetup:
         self._set_sensors(scenario)
         self._set_states(scenario)
         links = topology.links if algorithm.timing.talks else ()
-        ends = [[topology.index[i], topology.index[j]] for i, j in links]
-        self.ends = np.array(ends, dtype=np.int64).reshape(-1, 2)
+        self.ends = topology.ends[: len(links)]
         # Directions 2 l and 2 l + 1 belong to link l, as in the SimPy engine.
         self.directions_per_link = 1 if topology.directed else 2
         symmetric = scenario.network.channel.symmetric
@@ -331,21 +330,17 @@ class SlotSetup:
     def _make_links(self, scenario: Scenario) -> SlotLinks:
         """Return the W directed links sorted by receiver and sender, with their weights."""
         index = scenario.topology.index
+        ends = [(index[sender], index[receiver]) for sender, receiver in self.directions]
+        senders, receivers = np.array(ends, dtype=np.int64).reshape(-1, 2).T
+        weights = [scenario.weight(receiver, sender) for sender, receiver in self.directions]
         # By receiver and sender: the order in which a filter adds the messages it receives.
-        incoming = sorted(
-            (index[receiver], index[sender], direction, scenario.weight(receiver, sender))
-            for direction, (sender, receiver) in enumerate(self.directions)
-        )
-        # zip() of an empty list has no columns to unpack.
-        receivers, senders, directions, weights = (
-            zip(*incoming, strict=True) if incoming else [()] * 4
-        )
-        first = np.searchsorted(np.array(receivers, dtype=np.int64), np.arange(self.estimators + 1))
+        order = np.lexsort((senders, receivers))
+        first = np.searchsorted(receivers[order], np.arange(self.estimators + 1))
         return SlotLinks(
             first=np.asarray(first, dtype=np.int64),
-            sender=np.array(senders, dtype=np.int64),
-            direction=np.array(directions, dtype=np.int64),
-            weight=np.array(weights, dtype=np.float64),
+            sender=senders[order],
+            direction=order,
+            weight=np.array(weights, dtype=np.float64)[order],
         )
 
     def _set_channel(self, scenario: Scenario) -> None:
