@@ -634,7 +634,7 @@ def test_a_comparison_of_filters_has_a_page(tmp_path):
         certain = f"Certain: the RMS error of {row.filter} is "
         assert (certain in page.shown) == q.real
         assert f"{q.value:.4g}" in page.shown
-    assert """--filters 'push-sum,{kind="hcmci", steps=2},local,hybrid'""" in page.shown
+    assert """--filters 'push-sum,{ kind = "hcmci", steps = 2 },local,hybrid'""" in page.shown
     curves = page.data["filters"]["curves"]
     assert [curve["label"] for curve in curves] == [row.filter for row in ran]
     runs = netkf.monte_carlo(scenario.replace({"filter": {"kind": "local"}}), 8, workers=1)
