@@ -39,7 +39,11 @@ def address_of(array: Any) -> int:
 
 
 def readonly_array(value: ArrayLike) -> FloatArray:
-    """Return a read-only float64 copy of an array or nested lists of any shape."""
+    """Return a read-only float64 copy of an array or nested lists of any shape; raises TypeError or
+    ValueError for what is none of real numbers.
+    """
+    if np.iscomplexobj(value):
+        raise TypeError("complex numbers")  # numpy would drop their imaginary parts
     # A copy: the caller may go on writing into its own array.
     array = np.array(value, dtype=np.float64)
     array.flags.writeable = False

@@ -5,6 +5,7 @@ None of them is imported: a model is known by its attributes.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from decimal import Decimal
 from pathlib import Path
@@ -47,7 +48,10 @@ def from_control(
     with an input, and what ``netkf.load`` refuses.
     """
     known = hasattr(system, "A") and hasattr(system, "C")
-    space = system.to_ss() if not known and hasattr(system, "to_ss") else system
+    space = system
+    if not known and hasattr(system, "to_ss"):
+        with contextlib.suppress(TypeError):  # responses by frequency have no state
+            space = system.to_ss()
     if not all(hasattr(space, name) for name in ("A", "B", "C", "D", "dt")):
         remedy = "give control.ss(system), or one of scipy.signal.StateSpace"
         raise ScenarioError("system", "must be a state space", type(system).__name__, remedy)

@@ -334,7 +334,9 @@ def first_difference(a: Run | pd.DataFrame, b: Run | pd.DataFrame) -> str | None
     if row == len(one) == len(other):
         return None
     descriptions = [
-        " ".join(f"{name}={t[name].iloc[row]}" for name in names) if row < len(t) else "no event"
+        " ".join(f"{k}={v}" for k, v in t[names].iloc[row].dropna().items() if v != -1)
+        if row < len(t)
+        else "no event"
         for t in (one, other)
     ]
     return f"event {row}: {descriptions[0]} | {descriptions[1]}"

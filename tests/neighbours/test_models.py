@@ -90,6 +90,8 @@ def test_a_run_of_a_filterpy_filter_is_that_filter():
     ("call", "message"),
     [
         (lambda: netkf.from_control(3, 1, 1), "system: must be a state space; got 'int'"),
+        (lambda: netkf.from_control(frequencies(), 1, 1), "system: must be a state space; got 'F"),
+        (lambda: netkf.from_control(rotating(), np.eye(2), R), "A: must be a matrix"),
         (lambda: netkf.from_control(SYSTEM, np.eye(3), R), "Q: must have 2 rows"),
         (lambda: netkf.from_control(SYSTEM, np.eye(2), 1.0), "R: must have 2 rows"),
         (lambda: netkf.from_control(SYSTEM, -np.eye(2), R), "Q: must be"),
@@ -117,6 +119,14 @@ def test_what_is_no_model_is_refused_in_one_line(call, message):
 
 
 SYSTEM = signal.StateSpace(A, B, C, np.zeros((2, 1)))
+
+
+def frequencies():
+    return pytest.importorskip("control").frd([1.0, 2.0], [1.0, 2.0])
+
+
+def rotating():
+    return signal.StateSpace(1j * np.array(A), B, C, np.zeros((2, 1)))
 
 
 def faded():

@@ -179,4 +179,6 @@ def test_first_difference_names_the_event(ring):
     assert "kind=deliver" in words
     assert "kind=lost" in words
     short = netkf.simulate(ring.replace({"horizon": 15.0}))
-    assert "no event" in netkf.first_difference(one, short)
+    words = netkf.first_difference(one, short)
+    assert "no event" in words
+    assert not {"nan", "=-1"} & {word[-3:] for word in words.split()}  # of what an event lacks
