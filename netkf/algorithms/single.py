@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,7 +39,6 @@ from netkf.algorithms.records import Kernels, Records, double_past, make_records
 from netkf.linalg.addresses import call_kernel
 from netkf.linalg.arrays import FloatArray, IntArray, address_of
 from netkf.linalg.lanes import ONE
-from netkf.linalg.structs import Size
 
 
 class Whitened(NamedTuple):
@@ -191,7 +191,7 @@ class Surroundings:
             **fields | {"message": np.arange(degree)},
             size=size,
             lanes=ONE,
-            model=_tables_of(model, size),
+            model=_tables_of(model),
             first=np.array([0, info.degree]),
             sender=np.arange(degree),
             opposite=np.full(degree, -1),
@@ -287,19 +287,29 @@ def _run_class(model: Any) -> Any:
     return ClockRun if isinstance(model, FlowModel) else SingleSlotRun
 
 
-def _tables_of(model: Any, size: Size) -> Any:
+def _tables_of(model: Any) -> Any:
     """Return the model of one node as kernels take it."""
     if isinstance(model, MapModel | RateModel):
         return model.tables()
     if not isinstance(model, FlowModel):
         F, root_Q = (np.array(part, order="C") for part in (model.F, model.root_Q))
         return SlotTables(F=F, root_Q=root_Q)
+    # A node that follows changes has them in its tables; other nodes of one model share theirs.
+    make = _clock_tables if isinstance(model, ChangingFlowModel) else _shared_clock_tables
+    return make(model)
+
+
+def _clock_tables(model: FlowModel) -> Any:
+    size = size_of(len(model.A), unrolled=False)
     pieces = model.pieces if isinstance(model, ChangingFlowModel) else [model]
     table = stack_tables([flow for m in pieces for flow in (m.flow, m.unobserved_flow)])
     # As many of gains: those beside tables without readings are not used.
     gains = stack_gains([m.gains for m in pieces for _ in range(min(2, len(pieces)))])
     changes = np.array(getattr(model, "changes", ()), dtype=np.float64)
     return clock_tables(size, table, np.zeros(1, dtype=np.int64), gains, changes)
+
+
+_shared_clock_tables = lru_cache(maxsize=8)(_clock_tables)
 
 
 def begin(filtering: Any, model: Any, mean: FloatArray, cov: FloatArray, info: Any) -> NodeState:

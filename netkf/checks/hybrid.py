@@ -72,11 +72,12 @@ class HybridSamples(RunSamples):
 def _variance_exists(scenario: Scenario) -> Assumption:
     name, source = "the covariance has a variance", "derived"
     # Nodes whose own readings leave a mode that does not decay unseen: their P may grow for long.
-    unobserved = [
-        node
-        for node, model in zip(scenario.nodes, scenario.models, strict=True)
-        if undetectable_mode(model.A, model.H.T @ np.linalg.solve(model.R, model.H)) is not None
-    ]
+    hidden = {
+        model: undetectable_mode(model.A, model.H.T @ np.linalg.solve(model.R, model.H))
+        for model in set(scenario.models)
+    }
+    pairs = zip(scenario.nodes, scenario.models, strict=True)
+    unobserved = [node for node, model in pairs if hidden[model] is not None]
     if not unobserved:
         evidence = "every node detects the state by itself, so P is bounded"
         return Assumption(name, source, True, evidence)
