@@ -43,15 +43,17 @@ def _run(options: argparse.Namespace) -> int:
 
 def _run_once(scenario: Scenario, options: argparse.Namespace) -> int:
     """Simulate one run into ``--out``; ``--resume`` keeps a finished one."""
-    from netkf.ensembles.resume import clear_unfinished_runs
     from netkf.runs.run import run_to_directory
 
     if options.scheduler is not None:
         raise ScenarioError("--scheduler", "is for several runs", options.scheduler, "add --runs R")
     replica = options.replica or 0
-    if options.resume and not clear_unfinished_runs(options.out, scenario, replica, _print_note):
-        print(f"nothing left to do in {options.out}")
-        return 0
+    if options.resume:
+        from netkf.ensembles.resume import clear_unfinished_runs
+
+        if not clear_unfinished_runs(options.out, scenario, replica, _print_note):
+            print(f"nothing left to do in {options.out}")
+            return 0
     draw = None if options.no_plot else partial(pictures.draw_picture, pictures.RUN, scenario)
     with ProgressLine() as line:
         completed = run_to_directory(

@@ -28,7 +28,6 @@ from netkf.runs.files import (
     write_json,
     write_scenario,
 )
-from netkf.runs.held_out import errors_of_replica
 from netkf.runs.parquet_files import ParquetSink
 from netkf.runs.provenance import machine, versions
 from netkf.runs.quantities import NetworkSink
@@ -212,6 +211,8 @@ class _Output:
             usage = record_usage(self.scenario, self.links[0].sent if self.links else {})
             summary |= {"records": usage} if usage else {}
             if self.scenario.held_out_sensors:
+                from netkf.runs.held_out import errors_of_replica
+
                 manifest = self.manifest
                 summary["held_out"] = errors_of_replica(
                     self.scenario, manifest.seed, manifest.replica

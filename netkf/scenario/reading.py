@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
 import re
-import secrets
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -108,7 +108,7 @@ def parse_toml(text: str) -> dict[str, Any]:
     has_multiline_string = '"""' in text or "'''" in text
     arrays: dict[str, Any] = {}
     if len(text) > LONG_TEXT and not has_multiline_string:
-        prefix = secrets.token_hex(16)  # random, so that no text in the file begins with it
+        prefix = os.urandom(16).hex()  # random, so that no text in the file begins with it
         text = "\n".join(_extract_array(line, arrays, prefix) for line in lines)
     tables: dict[str, Any] = _insert_arrays(tomllib.loads(text), arrays)
     if _nesting_depth(tables) > MAX_DEPTH:
