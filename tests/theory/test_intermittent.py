@@ -211,3 +211,55 @@ def test_samples_and_exact_law_agree():
     assert scipy_stats.kstest(P, lambda x: wrong.cdf(x + 1e-9)).pvalue < 1e-4
     with pytest.raises(netkf.TheoryError, match="images of f_0 and f_1 meet"):
         theory.scalar_law(1.05, 1.0, 1.0, 100.0, 0.5)
+
+
+@pytest.mark.parametrize("unit", [1e-8, 1e7])
+def test_critical_probability_does_not_depend_on_units_of_outputs_or_states(unit):
+    """With an invertible H both bounds are 1 - 1/alpha^2, small rows and columns included."""
+    F = np.array([[1.5, 0.3], [0.0, 1.2]])
+    moved = np.diag([1.0, unit]) @ F @ np.diag([1.0, 1.0 / unit])
+    expected = [1.0 - 1.0 / 1.5**2] * 2
+    for case in ((F, [[1, 0], [0, unit]]), (moved, [[1, 1 / unit], [1, -1 / unit]])):
+        np.testing.assert_allclose(theory.critical_probability(*case), expected, rtol=1e-9)
+    F3, H = np.diag([1.5, 1.2, 1.1]), np.array([[1.0, 1.0, 0.0], [0.0, 1.0, 1.0]])
+    proof = theory.critical_certificate(F3, H * [[1.0], [unit]])
+    closed, g = F3 + proof.gain @ (H * [[1.0], [unit]]), proof.upper + 1e-6
+    mean_square = (1 - g) * np.kron(F3, F3) + g * np.kron(closed, closed)
+    assert np.abs(np.linalg.eigvals(mean_square)).max() < 1.0
+
+
+def test_arguments_of_a_wrong_kind_are_refused_with_one_line():
+    """A number where a list is meant, text, lists of unequal length, complex, None, masked."""
+    hybrid = netkf.load(SCENARIOS / "poisson_ring.toml")
+    push_sum = netkf.load(SCENARIOS / "push_sum_planar.toml")
+    eye = np.eye(2)
+    masked = np.ma.masked_array(eye, mask=[[1, 0], [0, 0]])
+    takes_number = {
+        "delivery": lambda x: theory.invariant_samples(*SCALAR, x, 2, 1),
+        "scalar": lambda x: theory.scalar_law(*SCALAR, x),
+        "gap": lambda x: theory.riccati_flow(eye, eye, eye, eye, x),
+        "rate": lambda x: theory.link_rate_for(hybrid, x),
+        "most": lambda x: theory.exact_minimum_gamma(push_sum, most=x),
+        "seed": lambda x: theory.disconnection_probability([(0, 1)], 0.5, seed=x),
+    }
+    takes_list = {
+        "times": lambda x: theory.covariance_bound(hybrid, x),
+        "constant": lambda x: theory.constant_gain_bound(hybrid, x or "no"),
+        "gains": lambda x: theory.constant_gain_bound(hybrid, [1.0], x or 1),
+        "map": lambda x: theory.push_sum_stability(push_sum, x, [0.9]),
+        "deliveries": lambda x: theory.push_sum_stability(push_sum, [1], x),
+        "noise": lambda x: theory.push_sum_noise(push_sum, x),
+        "covariances": lambda x: theory.push_sum_covariances(push_sum, x),
+        "up": lambda x: theory.mass_totals(push_sum, x),
+        "graph": lambda x: theory.disconnection_probability(x, 0.5),
+        "P": lambda x: theory.one_bit_update(x, [[1.0, 0.0]], 1.0),
+        "trigger": lambda x: theory.trigger_rate(x, [[1.0, 0.0]], 1.0, 1.0),
+        "scalar F": lambda x: theory.scalar_law(x, 1.0, 1.0, 1.0, 0.5),
+    }
+    calls = [(f, x) for f in takes_number.values() for x in ([0.5, 0.6], "text", None, 1j)]
+    calls += [(f, x) for f in takes_list.values() for x in ("text", None, 1j, [1, [2, 3]])]
+    calls.append((lambda x: theory.lyapunov_step(eye, x, eye), masked))
+    for call, value in calls:
+        with pytest.raises(netkf.TheoryError) as caught:
+            call(value)
+        assert "\n" not in str(caught.value)

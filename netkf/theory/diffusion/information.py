@@ -20,7 +20,7 @@ from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sensors import LinearSensor
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
-from netkf.theory.numerics.matrices import as_integer
+from netkf.theory.numerics.matrices import as_integer, as_number
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -284,6 +284,7 @@ def tracking_level(
     assumptions do: the errors stay bounded in L_p, and go to 0 with the noises (D Remark 4.1). From
     ``samples`` draws. Raises TheoryError for plants and sensors without a law and wrong arguments.
     """
+    p, beta = as_number("p", p), as_number("beta", beta)
     if not p >= 1.0 or not beta > 2.0:
         raise TheoryError(f"D (29) needs p >= 1 and beta > 2, got {p!r} and {beta!r}")
     samples, seed = as_integer("samples", samples, 100), as_integer("seed", seed, 0)

@@ -24,6 +24,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.theory.common.observations import joseph_update
 from netkf.theory.hybrid.coupled import CoupledRiccati, coupled_riccati
 from netkf.theory.hybrid.packed import PackedRiccati
+from netkf.theory.numerics.matrices import as_times
 
 TOLERANCE = 1e-10  # relative, of the solver
 ORDER = 28  # of Taylor series: few steps, each still far from where powers overflow
@@ -56,11 +57,7 @@ def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
     delay or samples, or where H(12) is stiff). Raises TheoryError, with the reason, if the theorem
     does not apply.
     """
-    instants = np.atleast_1d(np.asarray(times, dtype=np.float64))
-    if instants.ndim != 1 or not instants.size or not np.isfinite(instants).all():
-        raise TheoryError("times must be a list of finite numbers that is not empty")
-    if (np.diff(instants) < 0.0).any() or instants[0] < 0.0:
-        raise TheoryError("times must be increasing and not negative")
+    instants = as_times(times)
     if len(scenario.plant.changes):
         return _bound_over_pieces(scenario, instants)
     equations = coupled_riccati(scenario)

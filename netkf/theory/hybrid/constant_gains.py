@@ -21,6 +21,7 @@ from netkf.theory.hybrid.coupled import coupled_riccati
 from netkf.theory.hybrid.linearised import is_stable, solve_map
 from netkf.theory.hybrid.packed import LinearisedRiccati, PackedRiccati
 from netkf.theory.hybrid.steady import steady_covariance_bound
+from netkf.theory.numerics.matrices import as_list, as_numbers, as_times
 
 MAX_DENSE = 500  # unknowns up to which the exponential of the whole map is computed
 
@@ -43,9 +44,7 @@ def constant_gain_bound(
         if not is_stable(linear):
             raise TheoryError("constant gains do not stabilise the filters: no steady state")
         return packed.unpack(solve_map(linear, constant))
-    moments = np.atleast_1d(np.asarray(times, dtype=np.float64))
-    if not np.isfinite(moments).all() or (np.diff(moments, prepend=0.0) < 0.0).any():
-        raise TheoryError("times must be finite, increasing and not negative")
+    moments = as_times(times)
     # An entry that stays 1 makes the constant term part of a linear map.
     column = scipy.sparse.csc_array(constant.reshape(-1, 1))
     above = scipy.sparse.hstack([linear.matrix(), column])
@@ -73,7 +72,7 @@ def _linear_equation(
     if gains is None:
         P = steady_covariance_bound(scenario)
         gains = [p @ np.linalg.solve(R, H).T for p, (H, R) in zip(P, observations, strict=True)]
-    gain_matrices = [np.asarray(L, dtype=np.float64) for L in gains]
+    gain_matrices = [as_numbers("gains", L) for L in as_list("gains", gains)]
     if [L.shape for L in gain_matrices] != [(n, len(H)) for H, _ in observations]:
         raise TheoryError("gains must have one (n, p_i) array for each node")
     pairs = list(zip(gain_matrices, observations, strict=True))

@@ -13,7 +13,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.theory.hybrid.coupled import CoupledRiccati, coupled_riccati
 from netkf.theory.hybrid.limits import limit_covariance
 from netkf.theory.hybrid.steady import steady_state, threshold_factor
-from netkf.theory.numerics.matrices import as_numbers
+from netkf.theory.numerics.matrices import as_number
 
 MAX_FACTOR = 1e12  # of all rates: beyond it rounding decides
 NO_STEADY_STATE = 1e3  # stands for the logarithm of an infinite distance
@@ -62,7 +62,8 @@ def link_rate_for(scenario: Scenario, delta: float) -> LinkRate:
     rate. Raises TheoryError if H(12) or S do not apply or no rate up to 1e12 times the scenario's
     suffices.
     """
-    if as_numbers("delta", delta).size != 1 or not 0.0 < delta < math.inf:
+    delta = as_number("delta", delta)
+    if not 0.0 < delta < math.inf:
         raise TheoryError(f"delta must be a positive number, got {delta!r}")
     equations, S = _require_talk(scenario), limit_covariance(scenario)
     known: FloatArray | None = None

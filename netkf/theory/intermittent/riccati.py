@@ -21,6 +21,7 @@ from netkf.theory.numerics.matrices import (
     RESIDUAL,
     as_covariance,
     as_integer,
+    as_number,
     as_numbers,
     as_square,
 )
@@ -63,9 +64,10 @@ def _check_observation(H: ArrayLike, n: int) -> FloatArray:
 
 def check_delivery(delivery: float) -> float:
     """Return the delivery probability; raises TheoryError unless it lies in (0, 1]."""
-    if as_numbers("delivery", delivery).size != 1 or not 0.0 < delivery <= 1.0:
+    delivery = as_number("delivery", delivery)
+    if not 0.0 < delivery <= 1.0:
         raise TheoryError(f"delivery must lie in (0, 1], got {delivery!r}")
-    return float(delivery)
+    return delivery
 
 
 def lyapunov_step(P: ArrayLike, F: ArrayLike, Q: ArrayLike) -> FloatArray:
@@ -217,7 +219,7 @@ def critical_certificate(F: ArrayLike, H: ArrayLike) -> CriticalProbability:
     above, below = min(1.0, upper + 1e-6), max(0.0, upper - 1e-6)
     _, gains, _ = search.best((1.0 - above, above))
     _, _, perron = search.best((1.0 - below, below))
-    return CriticalProbability(lower, upper, gains[1], perron)
+    return CriticalProbability(lower, upper, gains[1] / _row_sizes(observation), perron)
 
 
 def _critical_bounds(F: FloatArray, H: FloatArray, search: _GainSearch) -> tuple[float, float]:
@@ -232,7 +234,8 @@ def _critical_bounds(F: FloatArray, H: FloatArray, search: _GainSearch) -> tuple
     # Without a mode outside the unit circle the mean is bounded for every positive probability.
     if alpha <= 1.0:
         return lower, lower
-    if np.linalg.matrix_rank(H) == 1:
+    relative = H / _row_sizes(H.T)  # neither units of states nor of outputs change a rank
+    if np.linalg.matrix_rank(relative / _row_sizes(relative)[:, None]) == 1:
         # Closed form for one output: 1 - 1 / (product of the squares of unstable eigenvalues).
         growing = np.maximum(moduli, 1.0)
         return lower, float(-np.expm1(-2.0 * np.log(growing).sum()))
@@ -255,17 +258,23 @@ def contraction_radius(F: FloatArray, arrivals: Sequence[tuple[float, FloatArray
     return _GainSearch(F, [H for _, H in arrivals]).best([p for p, _ in arrivals])[0]
 
 
+def _row_sizes(H: FloatArray) -> FloatArray:
+    """Return the largest entries (p,) of the rows of H (p, n), 1 for rows of zeros."""
+    sizes = np.abs(H).max(axis=1, initial=0.0)
+    return np.asarray(np.where(sizes > 0.0, sizes, 1.0))
+
+
 class _GainSearch:
     """Minimises the spectral radius of ``L: X -> sum_s p_s (F + K_s H_s) X (F + K_s H_s)'``.
 
     F is (n, n), ``readings`` the H_s (p, n), one for each set s of readings that may arrive, of
     which p can differ. Policy iteration over the gains K_s: L is a positive map, so that its radius
     is an eigenvalue with a semidefinite X, and gains that minimise L(X) for this X do not raise the
-    radius.
+    radius. Gains are those of rows of H_s in units of their largest entries.
     """
 
     def __init__(self, F: FloatArray, readings: Sequence[FloatArray]) -> None:
-        self._F, self._readings = F, readings
+        self._F, self._readings = F, [H / _row_sizes(H)[:, None] for H in readings]
         n = len(F)
         rows, columns = np.triu_indices(n)
         # The matrix that maps the upper triangle of a symmetric X to vec(X), and the indices of

@@ -21,6 +21,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import ArrayLike, FloatArray
 from netkf.linalg.spectra import contracts
 from netkf.theory.intermittent.riccati import check_system, steady_covariance
+from netkf.theory.numerics.matrices import as_number, as_numbers
 
 NEGLIGIBLE = 1e-18  # probability of the values that the recursion has not resolved yet
 DEPTH = 18  # maps that the bounds of the mean compose
@@ -158,16 +159,19 @@ def scalar_law(
     or if the values of P after a slot without a reading (f_0) and those after one with it (f_1)
     overlap, so that the recursion of the distribution function has two branches.
     """
-    system = check_system(*(np.atleast_2d(value) for value in (F, Q, H, R)))
+    system = check_system(
+        *(np.atleast_2d(as_numbers(*named)) for named in zip("FQHR", (F, Q, H, R), strict=True))
+    )
     if len(system.F) != 1 or len(system.H) != 1:
         raise TheoryError("the exact law is for one state and one output")
+    delivery = as_number("delivery", delivery)
     if not 0.0 < delivery < 1.0:
         raise TheoryError(f"delivery must lie in (0, 1), got {delivery!r}")
     F_, Q_, H_, R_ = (float(matrix[0, 0]) for matrix in system)
     smallest = float(steady_covariance(*system)[0, 0])
     if F_ == 0.0 or H_ == 0.0:
         raise TheoryError("the exact law needs F and H that are not zero")
-    law = ScalarLaw(F_, Q_, H_, R_, float(delivery), smallest)
+    law = ScalarLaw(F_, Q_, H_, R_, delivery, smallest)
     if not law.hole[0] < law.hole[1]:
         raise TheoryError("the images of f_0 and f_1 meet: no recursion with one branch")
     return law

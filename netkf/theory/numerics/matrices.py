@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from contextlib import suppress
 from typing import Any
 
@@ -23,13 +24,40 @@ MAX_STATES = 6
 def as_numbers(name: str, value: ArrayLike) -> FloatArray:
     """Return ``value`` as a float array, a number as (1, 1); a TheoryError calls it ``name``."""
     try:
-        if np.iscomplexobj(value):
+        if np.iscomplexobj(value) or np.ma.is_masked(value):
             raise TypeError
         array: FloatArray = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         message = "must be a matrix of real numbers, rows of equal length"
         raise TheoryError(f"{name} {message}, got a {type(value).__name__}") from None
     return array.reshape(1, 1) if array.ndim == 0 else array
+
+
+def as_number(name: str, value: ArrayLike) -> float:
+    """Return ``value``, one real number, as a float; else raises TheoryError."""
+    array = as_numbers(name, value)
+    if array.size != 1:
+        raise TheoryError(f"{name} must be one number, its shape is {array.shape}")
+    return float(array.reshape(()))
+
+
+def as_list(name: str, value: Iterable[Any]) -> list[Any]:
+    """Return ``value`` as a list; raises TheoryError if it is no sequence."""
+    try:
+        return list(value)
+    except TypeError:
+        raise TheoryError(f"{name} must be a list, got a {type(value).__name__}") from None
+
+
+def as_times(value: Any) -> FloatArray:
+    """Return times (T,), not negative and increasing, T > 0; else raises TheoryError."""
+    times = as_numbers("times", value)
+    times = times.reshape(-1) if times.size == 1 else times
+    if times.ndim != 1 or not times.size or not np.isfinite(times).all():
+        raise TheoryError("times must be a list of finite numbers that is not empty")
+    if (np.diff(times, prepend=0.0) < 0.0).any():
+        raise TheoryError("times must be increasing and not negative")
+    return times
 
 
 def as_integer(name: str, value: object, min_value: int, max_value: float = np.inf) -> int:
@@ -82,11 +110,12 @@ def riccati_flow(P: ArrayLike, A: ArrayLike, Q: ArrayLike, G: ArrayLike, gap: fl
     start, noise, information = (
         as_covariance(name, value, n) for name, value in (("P", P), ("Q", Q), ("G", G))
     )
-    if not (np.isfinite(gap) and gap >= 0.0):
+    gap = as_number("gap", gap)
+    if not 0.0 <= gap < np.inf:
         raise TheoryError(f"gap must be finite and not negative, got {gap!r}")
     if gap == 0.0:
         return start
-    end = move_covariances(flow_over(drift, noise, information, float(gap)), start)
+    end = move_covariances(flow_over(drift, noise, information, gap), start)
     if not np.isfinite(end).all():
         raise TheoryError(f"the solution overflows before {gap:g} s: an undetectable mode grows")
     return end

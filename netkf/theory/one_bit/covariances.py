@@ -10,6 +10,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import ArrayLike, FloatArray, symmetric
 from netkf.scenario.scenario import Scenario
 from netkf.theory.intermittent.riccati import check_system, lyapunov_step
+from netkf.theory.numerics.matrices import as_numbers
 from netkf.trace.run import Run
 from netkf.trace.schema import rows_of
 
@@ -22,9 +23,8 @@ def one_bit_update(P: ArrayLike, H: ArrayLike, R: ArrayLike) -> FloatArray:
     reading (Ribeiro, Giannakis and Roumeliotis 2006, equation 22). Raises TheoryError if shapes or
     definiteness are wrong.
     """
-    size = np.asarray(P, dtype=np.float64)
     # P is checked in the place of Q; F is not used.
-    _, result, H_, R_ = check_system(np.eye(len(np.atleast_2d(size))), P, H, R)
+    _, result, H_, R_ = check_system(np.eye(len(np.atleast_2d(as_numbers("P", P)))), P, H, R)
     # Whitened rows have independent noises of variance 1: they are used one after the other.
     for h in np.linalg.solve(np.linalg.cholesky(R_), H_):
         Ph = result @ h

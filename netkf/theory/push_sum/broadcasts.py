@@ -11,7 +11,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import ArrayLike, FloatArray
 from netkf.network.graphs import Topology
 from netkf.scenario.scenario import Scenario
-from netkf.theory.numerics.matrices import as_integer
+from netkf.theory.numerics.matrices import as_integer, as_numbers
 from netkf.theory.push_sum.estimation_steps import averaging_law
 
 MAX_NODES = 12  # of a network whose informed sets are enumerated
@@ -34,7 +34,7 @@ def mass_totals(
     """
     topology = graph.topology if isinstance(graph, Scenario) else graph
     links = np.array([[topology.index[a], topology.index[b]] for a, b in topology.links])
-    present, N = np.asarray(up, dtype=bool), len(topology.nodes)
+    present, N = as_numbers("up", up) != 0.0, len(topology.nodes)
     if present.ndim != 2 or present.shape[1] != len(links):
         raise TheoryError(f"up must have one column for each of {len(links)} links")
     if degrees not in ("nominal", "last"):

@@ -19,6 +19,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.spectra import contracts, growth_factor
 from netkf.scenario.scenario import Scenario
+from netkf.theory.numerics.matrices import as_integer
 from netkf.theory.push_sum.averaging import Averaging
 from netkf.theory.push_sum.disconnection import disconnection_probability
 from netkf.theory.push_sum.estimation_steps import estimation_steps
@@ -218,7 +219,7 @@ def exact_minimum_gamma(
     steps, measure = estimation_steps(scenario), mean_radius
     if _check_moment(moment) == "mean-square":
         measure = radius
-    for gamma in range(1, most + 1):
+    for gamma in range(1, as_integer("most", most, 1) + 1):
         if contracts(measure(steps.with_gamma(gamma))):
             return gamma
     raise TheoryError(f"no gamma up to {most} has a {moment} radius below 1")

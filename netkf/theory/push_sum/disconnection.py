@@ -22,6 +22,7 @@ from netkf.core.errors import TheoryError
 from netkf.network.graphs import Topology
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
+from netkf.theory.numerics.matrices import as_integer
 
 if TYPE_CHECKING:
     import networkx
@@ -80,6 +81,8 @@ def disconnection_probability(
     seconds). Raises TheoryError for directed graphs, and for links without a probability or with
     one outside [0, 1].
     """
+    seed = as_integer("seed", seed, 0)
+    samples = None if samples is None else as_integer("samples", samples, 1)
     if isinstance(graph, Scenario) and delivery is None:
         return _scenario_probability(graph, seed, samples)
     return _probability(*_link_probabilities(graph, delivery), seed, samples)
@@ -147,7 +150,11 @@ def _read_graph(graph: Any) -> tuple[list[Any], list[Edge], bool]:
 
     if isinstance(graph, networkx.Graph):
         return list(graph.nodes), [(i, j) for i, j in graph.edges()], graph.is_directed()
-    links = [(i, j) for i, j in graph]
+    try:
+        links = [(i, j) for i, j in graph]
+    except (TypeError, ValueError):
+        message = "graph must be a graph, a scenario or pairs of nodes"
+        raise TheoryError(f"{message}, got a {type(graph).__name__}") from None
     return list(dict.fromkeys(node for link in links for node in link)), links, False
 
 

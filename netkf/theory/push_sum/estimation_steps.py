@@ -12,7 +12,7 @@ from netkf.linalg.arrays import FloatArray, symmetric
 from netkf.network.matchings import Broadcast
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.random_links import delivery_of
-from netkf.theory.numerics.matrices import as_integer
+from netkf.theory.numerics.matrices import as_integer, as_number
 from netkf.theory.push_sum.averaging import Averaging
 from netkf.theory.push_sum.limits import PushSumLimits, push_sum_filter, push_sum_limits
 
@@ -116,9 +116,10 @@ def _probabilities(scenario: Scenario, delivery: float | None) -> FloatArray:
     """Return the probabilities (E, 2) that each end of a link hears the other."""
     loss, links = scenario.network.channel.loss, scenario.topology.links
     if delivery is not None:
+        delivery = as_number("delivery", delivery)
         if not 0.0 <= delivery <= 1.0:
             raise TheoryError(f"delivery must lie in [0, 1], got {delivery!r}")
-        return np.full((len(links), 2), float(delivery))
+        return np.full((len(links), 2), delivery)
     if not scenario.network.channel.independent:
         name = type(loss).__name__
         raise TheoryError(f"the draws of {name} depend on each other: no mean square is known")

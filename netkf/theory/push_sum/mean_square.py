@@ -20,6 +20,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, symmetric
 from netkf.linalg.spectra import contracts, growth_factor
 from netkf.scenario.scenario import Scenario
+from netkf.theory.numerics.matrices import as_list
 from netkf.theory.numerics.positive_maps import PositiveMap, fixed_point, spectral_radius
 from netkf.theory.push_sum.averaging import Averaging
 from netkf.theory.push_sum.estimation_steps import EstimationSteps, averaging_law, estimation_steps
@@ -55,13 +56,12 @@ def push_sum_stability(
     probabilities that all links have; the stability map.
     """
     steps = estimation_steps(scenario, averaging_law(scenario, 1.0))
+    gammas, deliveries = as_list("gammas", gammas), as_list("deliveries", deliveries)
     radii = np.empty((len(gammas), len(deliveries)))
     for column, delivery in enumerate(deliveries):
         law = averaging_law(scenario, delivery)
         for row, gamma in enumerate(gammas):
-            if int(gamma) != gamma or gamma < 1:
-                raise TheoryError(f"gamma must be a positive integer, got {gamma!r}")
-            radii[row, column] = radius(replace(steps, averaging=replace(law, gamma=int(gamma))))
+            radii[row, column] = radius(replace(steps, averaging=law).with_gamma(gamma))
     return radii
 
 
@@ -230,7 +230,7 @@ def push_sum_noise(scenario: Scenario, gammas: Sequence[int]) -> FloatArray:
     T = np.linalg.qr(first)[0]
     transform = np.kron(T * np.sign(T[0, 0]), np.eye(n))
     covariances = []
-    for gamma in gammas:
+    for gamma in as_list("gammas", gammas):
         moment = steps.with_gamma(gamma).averaging.second_moment(steps.noise)
         covariances.append(symmetric(transform.T @ moment @ transform))
     return np.array(covariances)
@@ -246,10 +246,10 @@ def push_sum_covariances(scenario: Scenario, gammas: Sequence[int]) -> FloatArra
     """
     steps = estimation_steps(scenario)
     N, n, _ = steps.closed.shape
-    covariances = np.full((len(gammas), N, n, n), np.nan)
-    for k, gamma in enumerate(gammas):
+    cases = [steps.with_gamma(gamma) for gamma in as_list("gammas", gammas)]
+    covariances = np.full((len(cases), N, n, n), np.nan)
+    for k, moved in enumerate(cases):
         try:
-            moved = steps.with_gamma(gamma)
             covariances[k] = _covariance(moved, radius(moved))
         except TheoryError:
             continue

@@ -29,7 +29,7 @@ from netkf.theory.common.observations import (
 from netkf.theory.common.random_links import all_messages_arrive
 from netkf.theory.common.slot_columns import SlotColumns
 from netkf.theory.intermittent.riccati import check_system, lyapunov_step
-from netkf.theory.numerics.matrices import as_covariance
+from netkf.theory.numerics.matrices import as_covariance, as_numbers
 from netkf.trace.run import Run
 from netkf.trace.schema import rows_of
 
@@ -113,9 +113,8 @@ def trigger_rate(P: ArrayLike, H: ArrayLike, R: ArrayLike, Y: ArrayLike) -> floa
     ``Pi = H P H' + R``, and Y (p, p) is the matrix of the trigger, which is silent with probability
     ``exp(-z' Y z / 2)`` (Han et al. 2015). Raises TheoryError if shapes or definiteness are wrong.
     """
-    spread = np.asarray(P, dtype=np.float64)
     # P is checked in the place of Q; F is not used.
-    _, C, H_, R_ = check_system(np.eye(len(np.atleast_2d(spread))), P, H, R)
+    _, C, H_, R_ = check_system(np.eye(len(np.atleast_2d(as_numbers("P", P)))), P, H, R)
     Pi = H_ @ C @ H_.T + R_
     return float(1.0 - np.linalg.det(np.eye(len(R_)) + Pi @ as_covariance("Y", Y, len(R_))) ** -0.5)
 
