@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from netkf.cli.options import load_scenario, print_notes
+from netkf.core.printable import count_phrase
 
 if TYPE_CHECKING:
     from netkf.scenario.scenario import Scenario
@@ -50,7 +51,7 @@ def _run(options: argparse.Namespace) -> int:
     with lock_directory(options.out):
         settings = EnsembleOptions(options.engine, options.trace)
         directory = plan_ensemble(scenario, options.runs, options.out, settings, tasks)
-    print_plan(directory, scenario, f"{options.runs:,} runs", tasks, options)
+    print_plan(directory, scenario, count_phrase(options.runs, "run"), tasks, options)
     return 0
 
 
@@ -61,7 +62,7 @@ def print_plan(
     print_notes(scenario.notes)
     # With a script on standard output, what a person reads goes beside it.
     out = sys.stderr if options.slurm else sys.stdout
-    print(f"{what} for {tasks:,} jobs, none of them simulated", file=out)
+    print(f"{what} for {count_phrase(tasks, 'job')}, none of them simulated", file=out)
     print(f"each: netkf work {directory}; in the end: netkf merge {directory}", file=out)
     print(f"written to {directory}", file=out)
     if options.slurm:

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 from netkf.cli.options import FAILED, print_notes
 from netkf.cli.progress import ProgressLine
 from netkf.core.errors import ScenarioError
+from netkf.core.printable import count_phrase
 
 if TYPE_CHECKING:
     from netkf.ensembles.parts import Part
@@ -58,7 +59,7 @@ def plan_study(run: Run, options: argparse.Namespace) -> int:
         runs = [gap.runs for gap in gaps]
         tasks = min(options.tasks, max(runs, default=1))
         write_study(options.plan, options.loaded, options.arguments, sum(runs), tasks)
-    what = f"{sum(runs):,} runs"
+    what = count_phrase(sum(runs), "run")
     if len(runs) > 1:
         what += f" of {len(runs):,} ensembles"
     if has_rounds(options):
@@ -248,7 +249,7 @@ def print_missing(plan: Plan, gaps: list[Gap], rounds: bool = False) -> None:
         for gap in short[:SHOWN]
     ]
     more = f"; and {len(short) - SHOWN} further ensembles" if len(short) > SHOWN else ""
-    of = f"{total:,} runs" + (f" of round {short[0].number}" if rounds else "")
+    of = count_phrase(total, "run") + (f" of round {short[0].number}" if rounds else "")
     print(f"{missing:,} of {of} have no result: {'; '.join(where)}{more}")
     again = ""
     if plan.tasks > 1:

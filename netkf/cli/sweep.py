@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from netkf.cli import pictures
 from netkf.cli.options import load_scenario, print_json, print_table_notes, print_title
 from netkf.cli.progress import ProgressLine
+from netkf.core.printable import count_phrase
 
 if TYPE_CHECKING:
     from netkf.scenario.scenario import Scenario
@@ -57,7 +58,7 @@ def _print_sweep(
     print_title(scenario)
     print(f"\n{format_sweep(completed.table, completed.keys)}\n")
     points = len(completed.table)
-    line = f"{points:,} point{'s' if points > 1 else ''} of {runs:,} run{'s' if runs > 1 else ''}"
+    line = f"{count_phrase(points, 'point')} of {count_phrase(runs, 'run')}"
     line += f" in {completed.seconds:.2f} s"
     line += "" if "seed" in completed.keys else ", all with the same random draws"
     print(line + ("; +- one standard error" if runs > 1 else ""))

@@ -58,6 +58,11 @@ def list_some(values: Sequence[object], most: int) -> str:
     return ", ".join(map(str, values[:most])) + ", ..." * (len(values) > most)
 
 
+def count_phrase(count: int, what: str) -> str:
+    """Return a count with its noun, in the plural unless it is 1."""
+    return f"{count:,} {what}{'' if count == 1 else 's'}"
+
+
 def shorten(text: object, max_length: int = 200) -> str:
     """Return a text as one line of at most ``max_length`` characters, see :func:`cut_middle`."""
     return cut_middle(one_line(text), max_length)

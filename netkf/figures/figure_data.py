@@ -10,6 +10,7 @@ import numpy as np
 
 from netkf.checks.innovations import Innovations, compute_innovations
 from netkf.core.errors import ScenarioError
+from netkf.core.printable import count_phrase
 from netkf.ensembles.monte_carlo import Ensemble
 from netkf.ensembles.summary import mean_bounds
 from netkf.linalg.arrays import FloatArray
@@ -156,7 +157,7 @@ class FigureData:
         assumptions that are not met, on the "bound" on P, on "nees", or on "both".
         """
         n = len(self.nodes)
-        origin = f"{self.scenario.name}: {n} node{'s' if n > 1 else ''}, {self.count_text}."
+        origin = f"{self.scenario.name}: {count_phrase(n, 'node')}, {self.count_text}."
         rounding = ""
         if np.isfinite(self.rounding_from) and self.shows_errors:
             rounding = f"Rounding of a large state blurs errors from {self.rounding_from:g} s on."

@@ -12,6 +12,7 @@ import numpy as np
 
 from netkf.algorithms.registry import built_in_filters
 from netkf.core.errors import NetkfError, TheoryError
+from netkf.core.printable import count_phrase
 from netkf.figures.figure_data import FigureData, UnavailableError
 from netkf.figures.names import SERIES
 from netkf.figures.style import (
@@ -136,7 +137,7 @@ def sweep_figure(name: str, table: Any, keys: Sequence[str], status: str) -> Pic
         points += f"; the sweep was {status}"
     runs = int(table["runs"].max()) if len(table) else 0
     bars = " Bars: 95% intervals." if runs > 1 and len(keys) == 1 else ""
-    replicas = f"{runs} run{'s' if runs != 1 else ''} each, the same draws at all of them"
+    replicas = f"{count_phrase(runs, 'run')} each, the same draws at all of them"
     caption = [f"{points}, {replicas}.{bars}"]
     if not len(table) or len(keys) > 2:
         reason = "has no finished point" if not len(table) else "has more than two keys"

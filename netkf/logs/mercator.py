@@ -14,11 +14,11 @@ import numpy as np
 import pandas as pd
 
 from netkf.core.errors import ScenarioError
+from netkf.core.printable import count_phrase
 from netkf.logs.packet_tables import find_extra, read_positions
 from netkf.logs.packets import (
     PacketLog,
     choose_origin,
-    count_phrase,
     parse_numbers,
     parse_stamps,
     read_texts,

@@ -11,12 +11,12 @@ import numpy as np
 import pandas as pd
 
 from netkf.core.errors import ScenarioError
+from netkf.core.printable import count_phrase
 from netkf.linalg.arrays import FloatArray
 from netkf.logs.packets import (
     MAX_SKIP,
     PacketLog,
     choose_origin,
-    count_phrase,
     find_resolution,
     parse_numbers,
     parse_stamps,

@@ -18,6 +18,7 @@ import pandas as pd
 from netkf.core.csv_files import open_table
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import SourceFile
+from netkf.core.printable import count_phrase
 from netkf.core.stamps import UNITS, TimeBase
 from netkf.linalg.arrays import FloatArray
 
@@ -69,11 +70,6 @@ class PacketLog:
     readings: pd.DataFrame = field(default_factory=pd.DataFrame)
     is_run: bool = False
     ticks: Path | None = None
-
-
-def count_phrase(count: int, what: str) -> str:
-    """Return a count with its noun, in the plural unless it is 1."""
-    return f"{count:,} {what}{'' if count == 1 else 's'}"
 
 
 def read_texts(path: Path) -> pd.DataFrame:

@@ -11,8 +11,9 @@ import numpy as np
 import pandas as pd
 
 from netkf.core.errors import ScenarioError
+from netkf.core.printable import count_phrase
 from netkf.core.stamps import TimeBase
-from netkf.logs.packets import PacketLog, accounts, count_phrase, settle
+from netkf.logs.packets import PacketLog, accounts, settle
 from netkf.network.clocks import LinkClock, OnReadings
 from netkf.network.matchings import Matching
 from netkf.scenario.scenario import Scenario

@@ -13,10 +13,10 @@ import numpy as np
 import pandas as pd
 
 from netkf.core.errors import ScenarioError
+from netkf.core.printable import count_phrase
 from netkf.logs.packet_tables import find_column, find_extra, read_positions, read_readings
 from netkf.logs.packets import (
     PacketLog,
-    count_phrase,
     find_resolution,
     parse_numbers,
     parse_stamps,

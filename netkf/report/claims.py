@@ -10,6 +10,7 @@ import numpy as np
 import scipy
 
 from netkf.checks.innovations import Innovations
+from netkf.core.printable import count_phrase
 from netkf.engines.soundness import describe_divergence
 from netkf.linalg.arrays import FloatArray
 from netkf.report.directories import ReportSource
@@ -277,8 +278,8 @@ def _describe_last_messages(
         listed += f" (the {MAX_LISTED} oldest of {len(heard)} links)"
     silent = len(ages) - len(heard)
     if oldest and silent:
-        listed += f" and had not heard {silent} other node{'s' if silent > 1 else ''} yet"
-    losses = f"{missing:,} message{'s' if missing != 1 else ''} to it had been lost or late "
+        listed += f" and had not heard {count_phrase(silent, 'other node')} yet"
+    losses = f"{count_phrase(missing, 'message')} to it had been lost or late "
     losses += "since" if oldest else "by then"
     return f"Why: {listed}; {losses}"
 

@@ -14,6 +14,7 @@ import numpy as np
 from netkf.algorithms.baselines import Central
 from netkf.checks.innovations import with_filter
 from netkf.core.errors import NetkfError
+from netkf.core.printable import count_phrase
 from netkf.network.clocks import LinkClock
 from netkf.report.directories import ReportSource
 from netkf.report.markup import bullets, paragraph, table_box
@@ -140,7 +141,7 @@ def _describe_smallest_set(explanation: Why) -> str:
     if not messages:
         return f"; none of the {smallest.considered:,} messages tried one by one helps"
     trace = smallest.best_trace if smallest.messages is None else smallest.trace
-    count = f"{len(messages)} message{'s' if len(messages) > 1 else ''}"
+    count = count_phrase(len(messages), "message")
     return (
         f"; {count} alone, of {smallest.candidates:,} that could have mattered, would have brought "
         f"trace P to {format_number(trace)}"

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from netkf.core.printable import shorten
+from netkf.core.printable import count_phrase, shorten
 from netkf.runs.tables import format_number, format_table, format_with_error, shorten_rows
 from netkf.studies.compare import Comparison
 from netkf.studies.compare_filters import ComparedFilter, FilterComparison
@@ -177,7 +177,7 @@ def _filter_legend(
 ) -> list[str]:
     noted = [row for row in comparison.rows if row.status != "complete"]
     lines = [f"{shorten(row.filter)}: {row.status}" for row in noted]
-    runs = f"{comparison.runs:,} run{'s' if comparison.runs > 1 else ''} of each on the same draws"
+    runs = f"{count_phrase(comparison.runs, 'run')} of each on the same draws"
     lines.append(f"{runs}; +-: one standard error; differences from {shorten(ran[0].filter)}, run")
     lines.append(
         f"by run; * for certain, all marks together at confidence {comparison.confidence:g}"
@@ -219,7 +219,7 @@ def format_comparison(comparison: Comparison) -> str:
     """Return finished runs side by side, significant differences starred."""
     numbered = [f"({k + 1})" for k in range(len(comparison.directories))]
     lines = [
-        f"{mark} {shorten(directory)}: {shorten(name)}, {runs:,} run{'s' if runs > 1 else ''}"
+        f"{mark} {shorten(directory)}: {shorten(name)}, {count_phrase(runs, 'run')}"
         for mark, directory, name, runs in zip(
             numbered, comparison.directories, comparison.names, comparison.runs, strict=True
         )
