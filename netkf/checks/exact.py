@@ -87,7 +87,8 @@ def summarise_exactly(scenario: Scenario, run: Run) -> ReplicaSummary:
     times, nodes, n = run.error.shape
     e = np.where(blurred_samples(run, run.P)[..., None], np.nan, run.error)
     law = None
-    if run.replica < max_replayed(scenario) and few_errors(scenario).holds:
+    is_replayed = few_errors(scenario).holds
+    if is_replayed and run.replica < max_replayed(scenario):
         # Where there is none an assumption says so, and rows that need it are not promised.
         with contextlib.suppress(TheoryError):
             law = _law_of_nodes(error_law(with_promised_filter(scenario), whole), known)
@@ -96,6 +97,7 @@ def summarise_exactly(scenario: Scenario, run: Run) -> ReplicaSummary:
         by_node["mean"] = np.full(e.shape, np.nan)
         # One weight for each error of all nodes at all sample times.
         size = times * nodes * n if not known.all() else times * errors_at_once(scenario)
+        size = size if is_replayed else 0  # of no run
         shapes = {"whole": (len(at), 2), "joint": (2,), "quadratic": (1 + size,)}
         pooled = {name: np.full(shape, np.nan) for name, shape in shapes.items()}
         pooled["bias"] = np.full((n, n + 1), np.nan)

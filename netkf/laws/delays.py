@@ -29,7 +29,8 @@ class DelayCounts(NamedTuple):
 
     cells    : (CELLS, 2) numbers of u in equal parts of [0, 1], and of those looked at
     products : (3,) sums over neighbouring delays of a direction (:func:`correlate_neighbours`)
-    sums     : (2, D) of each direction the number of delays and the sum of u - 1/2
+    sums     : (2, D) of each direction the number of delays and the sum of u - 1/2; (2, 0) if all
+               should be constant
     off      : () largest distance in seconds of a delay from a stated constant
     """
 
@@ -39,12 +40,10 @@ class DelayCounts(NamedTuple):
     off: FloatArray
 
 
-def count_fixed(ages: FloatArray, fixed: float, size: int) -> DelayCounts:
+def count_fixed(ages: FloatArray, fixed: float) -> DelayCounts:
     """Return the distance of ``ages`` (K,) in seconds from a ``fixed`` delay, as counts."""
     largest_error = np.abs(ages - fixed).max(initial=0.0)
-    return DelayCounts(
-        np.zeros((CELLS, 2)), np.zeros(3), np.zeros((2, size)), np.array(largest_error)
-    )
+    return DelayCounts(np.zeros((CELLS, 2)), np.zeros(3), np.zeros((2, 0)), np.array(largest_error))
 
 
 def count_delays(

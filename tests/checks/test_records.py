@@ -221,6 +221,14 @@ RANKS = {
 }
 
 
+def test_networks_too_large_for_simpy_are_not_run_there(runs, monkeypatch):
+    scenario, run = runs["gossip"]
+    monkeypatch.setattr(rows, "MAX_TWIN_EVENTS", 10)
+    monkeypatch.setattr(rows, "SimpyEngine", None)
+    audit = rows.audit_run(scenario, dataclasses.replace(run, replica=0), 3, 0, CompiledEngine())
+    assert audit.engines.startswith(f"{rows.UNKNOWN}3 slots have ")
+
+
 @pytest.mark.parametrize("change", RANKS)
 def test_another_order_in_one_engine_is_found_by_the_other(change, tmp_path, monkeypatch):
     scenario = scenario_of("coincident", tmp_path)

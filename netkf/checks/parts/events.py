@@ -215,7 +215,9 @@ def losses_of(scenario: Scenario, run: Run) -> LossCounts | None:
     is_lost = np.isin(sent_at * width + sends["message"], keys)
     of_broadcasts = slice(None) if scenario.has_broadcasts else slice(0)
     pairs = _pairs_of_hearers(sends[of_broadcasts], is_lost[of_broadcasts])
-    return LossCounts(sent, lost, *counts, *pairs)
+    # Those of hundreds of runs are in memory at once.
+    short = (column.astype(np.int32) for column in (sent, lost, *counts))
+    return LossCounts(*short, *pairs)
 
 
 def _pairs_of_hearers(sends: np.ndarray, is_lost: np.ndarray) -> list[np.ndarray]:
@@ -288,7 +290,7 @@ def delays_of(scenario: Scenario, run: Run) -> DelayCounts | None:
     if not count or (fixed is None and law is None):
         return None
     if fixed is not None:
-        return count_fixed(rows["age"], fixed, count)
+        return count_fixed(rows["age"], fixed)
     sent, directions, ages = _follow_messages(scenario, run, rows)
     return count_delays(law, sent, ages, directions, count, scenario.horizon)
 

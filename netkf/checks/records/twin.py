@@ -39,7 +39,8 @@ def twin_fault(scenario: Scenario, run: Run, twin: Run) -> str:
 def _gaps(scenario: Scenario, run: Run, twin: Run) -> list[tuple[str, FloatArray, FloatArray]]:
     """Return names of values, the differences (T, N) of two runs, and what rounding explains."""
     covs = [scenario.initial_estimate(node)[1] for node in scenario.nodes]
-    starts = np.stack([enlarged(cov, *np.max([c.shape for c in covs], axis=0)) for cov in covs])
+    rows, columns = np.max([cov.shape for cov in covs], axis=0)
+    starts = np.stack([enlarged(cov, rows, columns) for cov in covs])
     # Errors of unknown states are nan in both, as are states that a node does not estimate.
     unknown = np.isnan(twin.error) & np.isnan(run.error) & np.isfinite(twin.xhat)
     error, run_error = (np.where(unknown, 0.0, one.error) for one in (twin, run))
