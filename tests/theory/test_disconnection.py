@@ -94,6 +94,8 @@ def test_an_interval_where_it_is_not_exact(monkeypatch):
         ([(0, 1), (1, 2)], {(1, 0): 0.5}, "must be given for link"),
         ([(0, 1)], None, "must be given"),
         ([], 0.5, "must have a node"),
+        ([(0, 1), (1, 0)], {(0, 1): 0.5, (1, 0): 0.9}, "has two probabilities: 0.5 and 0.9"),
+        (networkx.MultiGraph([(0, 1), (0, 1)]), 0.5, "several links in parallel"),
         (planar(1, 0.7, symmetric=False), None, "fail apart"),
     ],
 )

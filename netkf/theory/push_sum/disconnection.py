@@ -124,12 +124,15 @@ def _link_probabilities(
         graph = graph.topology
     names, links = _nodes_and_links(graph)
     index = {name: k for k, name in enumerate(names)}
-    probabilities = {}
+    probabilities: dict[tuple[int, int], float] = {}
     for link in links:
         i, j = sorted(index[end] for end in link)
         # Self-loops connect nothing.
-        if i != j:
-            probabilities[i, j] = _link_probability(link, delivery)
+        if i == j:
+            continue
+        p = _link_probability(link, delivery)
+        if probabilities.setdefault((i, j), p) != p:
+            raise TheoryError(f"link {link} has two probabilities: {probabilities[i, j]} and {p}")
     return len(names), probabilities
 
 
@@ -149,7 +152,13 @@ def _read_graph(graph: Any) -> tuple[list[Any], list[Edge], bool]:
     import networkx
 
     if isinstance(graph, networkx.Graph):
-        return list(graph.nodes), [(i, j) for i, j in graph.edges()], graph.is_directed()
+        links = [(i, j) for i, j in graph.edges()]
+        if graph.is_multigraph() and graph.number_of_edges() > networkx.Graph(graph).size():
+            raise TheoryError(
+                "nodes have several links in parallel; give one with the probability that any of "
+                "them delivers"
+            )
+        return list(graph.nodes), links, graph.is_directed()
     try:
         links = [(i, j) for i, j in graph]
     except (TypeError, ValueError):
