@@ -216,8 +216,8 @@ def losses_of(scenario: Scenario, run: Run) -> LossCounts | None:
     of_broadcasts = slice(None) if scenario.has_broadcasts else slice(0)
     pairs = _pairs_of_hearers(sends[of_broadcasts], is_lost[of_broadcasts])
     # Those of hundreds of runs are in memory at once.
-    short = (column.astype(np.int32) for column in (sent, lost, *counts))
-    return LossCounts(*short, *pairs)
+    short = np.int16 if sent.max() < 1 << 15 else np.int32
+    return LossCounts(*(column.astype(short) for column in (sent, lost, *counts)), *pairs)
 
 
 def _pairs_of_hearers(sends: np.ndarray, is_lost: np.ndarray) -> list[np.ndarray]:
