@@ -133,11 +133,11 @@ class Topology:
     @cached_property
     def directions(self) -> tuple[Link, ...]:
         """The sorted pairs (sender, receiver): both directions of each link unless directed."""
-        pairs = self._direction_ends.tolist()
+        pairs = self.direction_ends.tolist()
         return tuple((self.nodes[i], self.nodes[j]) for i, j in pairs)
 
-    @property
-    def _direction_ends(self) -> np.ndarray:
+    @cached_property
+    def direction_ends(self) -> np.ndarray:
         """The indices (D, 2) in ``nodes``, which are in increasing order, of ``directions``."""
         both = self.ends if self.directed else np.concatenate([self.ends, self.ends[:, ::-1]])
         return both[np.lexsort((both[:, 1], both[:, 0]))]
@@ -152,7 +152,7 @@ class Topology:
 
     def _peers(self, end: int) -> dict[int, tuple[int, ...]]:
         """Return the peers of each node as ``end`` of directions: 0 sender, 1 receiver."""
-        pairs = self._direction_ends
+        pairs = self.direction_ends
         pairs = pairs[np.argsort(pairs[:, end], kind="stable")]
         firsts = np.searchsorted(pairs[:, end], np.arange(len(self.nodes) + 1)).tolist()
         ids = [self.nodes[k] for k in pairs[:, 1 - end].tolist()]

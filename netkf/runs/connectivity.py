@@ -54,9 +54,7 @@ class ConnectivitySink(Sink):
         self.by_messages = recorded or by_messages
         parts = topology.radius, self._contacts
         self.changes = bool(lives) or self.by_messages or parts != (None, None)
-        index = topology.index
-        self._ends = np.array([(index[i], index[j]) for i, j in topology.directions], dtype=int)
-        self._ends = self._ends.reshape(-1, 2)
+        self._ends = topology.direction_ends
         number = {link: k for k, link in enumerate(topology.links)}
         # The link of each direction: its own of a directed graph.
         links = [number.get((i, j), number.get((j, i))) for i, j in topology.directions]
