@@ -105,10 +105,14 @@ def emit(record: Any, h: int, m: int, run: Any) -> None:
     if run.phase == AVERAGE:
         copy_vector(lanes, run.size, payload.xhat, m, record.xhat, h, True)
         return
+    awake = load_flags(lanes, run.sends)
     for i in range(mass.shape[1]):
-        share = load(lanes, mass, h, i) / (record.degree[h, 0] + 1)
+        before = load(lanes, mass, h, i)
+        share = before / (record.degree[h, 0] + 1)
         if record.running == 1:
-            share += load(lanes, record.offered, h, i)
+            # What is offered leaves the node now; one that is down offers nothing.
+            store(lanes, mass, h, i, select(awake, share, before))
+            share = load(lanes, record.offered, h, i) + select(awake, share, 0.0)
             store(lanes, record.offered, h, i, share)
         store(lanes, payload.mass, m, i, share)
     # Asymptotic gains need no mass, and by the paper's rule a stopped node sends none.
@@ -178,8 +182,8 @@ def mix_mass(record: Any, h: int, run: Any) -> None:
 
 @kernel
 def receive_totals(record: Any, h: int, run: Any) -> None:
-    """Set the mass of node h to its own share plus the growth of the totals that arrive, which
-    replace the last ones heard.
+    """Add the growth of the totals that arrive, which replace the last ones heard, to the mass of
+    node h.
     """
     lanes, mass, heard = run.lanes, record.mass, record.heard
     for i in range(mass.shape[1]):
@@ -191,8 +195,7 @@ def receive_totals(record: Any, h: int, run: Any) -> None:
             offered = load(lanes, record.payload.mass, run.message[k], i)
             total += select(arrived, offered - last, 0.0)
             store(lanes, heard, w, i, select(arrived, offered, last))
-        own = load(lanes, mass, h, i) / (record.degree[h, 0] + 1)
-        store(lanes, mass, h, i, own + total)
+        store(lanes, mass, h, i, load(lanes, mass, h, i) + total)
 
 
 @kernel

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 import netkf
+from netkf.engines.compiled.engine import CompiledEngine
 from netkf.scenario.reading import from_table
 from netkf.theory.errors import error_law
 from tests.engines.agreement import assert_agree
 from tests.engines.linearity import engine_covariance
+from tests.engines.test_batches import assert_alone
 from tests.theory.test_replay import close
 
 
@@ -120,6 +122,16 @@ def test_both_engines_keep_the_same_totals_and_theory_follows_them():
     exact, run = engine_covariance(again, "simpy")
     close(netkf.theory.error_covariance(again, run), exact, 1e-9)
     assert fast.count("lost") > 50
+
+
+def test_nodes_that_are_down_offer_nothing():
+    """Neither alone, nor beside a run in which the node is up."""
+    made = in_slots(running_sums=True).replace(
+        {"network.lives": [{"kind": "crashes", "nodes": [1, 3], "mean_up": 4.0, "mean_down": 3.0}]}
+    )
+    assert_alone(made, CompiledEngine(), 5, range(4), fingerprint=True)
+    for start, end in assert_agree(made.replace({"horizon": 12.0}), 2).sums.values():
+        assert abs(end - start) < 1e-12 * start
 
 
 def test_running_sums_go_with_no_stop_rule():

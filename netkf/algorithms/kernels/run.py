@@ -80,7 +80,8 @@ class SlotRun(Struct):
         reading that the sender had at the time of sending (-1: none), and flags (L,) of the runs in
         which it has arrived
     receiver : for ``emit`` of an addressed filter, ``records.Kernels``
-    sends : (L,), 1 on entry of ``emit``; it writes 0 where the node sends nothing
+    sends : (L,), on entry of ``emit`` 0 where the node is down: it then leaves the record as it is;
+            it writes 0 where the node sends nothing
     uniform : (L,), uniform numbers for ``emit`` of a randomised filter
     common : (W, n), for each link and component of the receiver's state which component of the
              sender's it is, -1: none; (0, 0) where messages need no translation

@@ -238,12 +238,13 @@ def exchange(
     if e != plan.begin and verbs.emit != NOTHING:
         # All messages are made before any arrives.
         for h in range(nodes):
-            if plan.sent.shape[0] > 0 and not any_lane(load_flags(lanes, plan.sent, b, s, e, h)):
-                continue
-            if decides:
-                store_flags(lanes, run.sends, load_flags(lanes, plan.sent, b, s, e, h))
-                if plan.uniform.shape[0] > 0:
-                    store(lanes, run.uniform, load(lanes, plan.uniform, b, s, e, h))
+            if plan.sent.shape[0] > 0:
+                asked = load_flags(lanes, plan.sent, b, s, e, h)
+                if not any_lane(asked):
+                    continue
+                store_flags(lanes, run.sends, asked)
+            if plan.uniform.shape[0] > 0:
+                store(lanes, run.uniform, load(lanes, plan.uniform, b, s, e, h))
             run.reading = h
             choose_model(run, plan, h)
             m = h + run.first[h] if verbs.addressed == 1 else h
