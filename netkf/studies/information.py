@@ -29,9 +29,11 @@ NEVER = -1
 OUTCOMES = ("used", "lost", "late", "refused", "under way", "unused")
 """Outcome of a message at the end of a log. Late messages arrived after the exchange of their slot,
 refused ones were too old for the filter, unused ones were replaced by another message of the same
-instant.
+instant, or their receiver went down before it used them.
 """
 USED, LOST, LATE, REFUSED, UNDER_WAY, UNUSED = range(len(OUTCOMES))
+ENDS = ("absorb", "swap", "crash", "leave")
+"""Kinds of events after which nothing that arrived before waits at a node."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,9 +83,12 @@ def match_messages(log: IntArray, swaps: bool, slotted: bool) -> Messages:
     used_row = np.full(len(joined), NEVER)
     arrivals = np.flatnonzero(joined["outcome"] == DELIVERED)
     used_row[arrivals] = _next_use(log, joined["end_row"][arrivals])
+    stopped = arrivals[np.isin(log["kind"][used_row[arrivals]], [CODES["crash"], CODES["leave"]])]
     # By outcome in the log: DELIVERED, LOST, LATE, UNDER_WAY.
     outcome = np.array([USED, LOST, LATE if slotted else REFUSED, UNDER_WAY])[joined["outcome"]]
-    outcome[arrivals] = np.where(used_row[arrivals] == NEVER, UNDER_WAY, USED)
+    outcome[stopped] = UNUSED
+    outcome[arrivals[used_row[arrivals] == NEVER]] = UNDER_WAY
+    used_row[stopped] = NEVER
     if swaps:
         used = np.flatnonzero(outcome == USED)
         # A swap uses the last message of the sender with the largest id.
@@ -104,10 +109,12 @@ def match_messages(log: IntArray, swaps: bool, slotted: bool) -> Messages:
 
 
 def _next_use(log: IntArray, rows: IntArray) -> IntArray:
-    """Return the rows (K,) at which nodes use arrivals at ``rows``; NEVER without one."""
+    """Return the rows (K,) at which nodes use arrivals at ``rows``, or go down before they do;
+    NEVER without one.
+    """
     # One sorted search for all nodes: keys order the uses by node, then by row of the log. The
     # result may be a use by the following node, which the last line rejects.
-    uses = np.flatnonzero((log["kind"] == CODES["absorb"]) | (log["kind"] == CODES["swap"]))
+    uses = np.flatnonzero(np.isin(log["kind"], [CODES[kind] for kind in ENDS]))
     ids, length = np.unique(log["node"]), len(log) + 1
     keys = np.searchsorted(ids, log["node"][uses]) * length + uses
     order = np.argsort(keys)

@@ -24,6 +24,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.theory import covariance_bound, riccati_step
 from netkf.theory.common.evidence import require_every_reading, require_linear
 from netkf.theory.errors import error_squares
+from netkf.theory.hybrid.samples import randomly_sampled_sensors
 from netkf.trace.nees import traces
 from netkf.trace.schema import KINDS
 
@@ -171,9 +172,11 @@ def bound_traces(scenario: Scenario) -> FloatArray:
 
 def central_trace(scenario: Scenario) -> float:
     """Return the trace of P of a filter with all readings and the true model, averaged over time
-    and over what nodes estimate. Raises TheoryError if readings are recorded or missing, or H is
-    random.
+    and over what nodes estimate. Raises TheoryError if readings are recorded or missing, their
+    times or H random.
     """
+    if randomly_sampled_sensors(scenario):
+        raise TheoryError("sensors sample at random times: the central filter has a bound, no P")
     network = dataclasses.replace(scenario.network, clocks=())
     filtering = Filtering(algorithm=Central())
     central = dataclasses.replace(scenario, filter=filtering, network=network)

@@ -16,6 +16,7 @@ from netkf.runs.quantities import NETWORK
 from netkf.scenario.scenario import Scenario
 from netkf.studies.metrics import RunMetrics, bound_traces, central_trace
 from netkf.theory import assumptions
+from netkf.theory.hybrid.samples import randomly_sampled_sensors
 
 REACHED, MISSED, UNDECIDED, NOT_SHOWN = "reached", "missed", "undecided", "not shown"
 """States of a value; ``not shown``: an upper bound is above the limit, which proves nothing."""
@@ -139,7 +140,7 @@ def quantity_by_theory(scenario: Scenario, target: Target) -> tuple[float, str]:
     traces, algorithm = bound_traces(scenario), scenario.filter.algorithm
     # Without exchange the bound of bound_traces() is the covariance itself.
     message = "exact: the covariance of filters that do not talk"
-    if algorithm.timing.talks:
+    if algorithm.timing.talks or randomly_sampled_sensors(scenario):
         message = "an upper bound: the trace of Tanwani's H(12), which E[P_i] stays below"
     if target.of_errors:
         message += _explain_errors(scenario)
@@ -151,7 +152,7 @@ def quantity_by_theory(scenario: Scenario, target: Target) -> tuple[float, str]:
 
 def theory_is_exact(scenario: Scenario, target: Target) -> bool:
     """Return True if ``quantity_by_theory`` is the quantity itself, False if it is a bound."""
-    if scenario.filter.algorithm.timing.talks:
+    if scenario.filter.algorithm.timing.talks or randomly_sampled_sensors(scenario):
         return False
     return not target.of_errors or not scenario.other_starts
 

@@ -12,7 +12,7 @@ from netkf.linalg.compiling import kernel
 from netkf.linalg.structs import Struct
 from netkf.trace.schema import CODES
 
-SENSE, SEND, DROP, DELIVER, USE, FORGET = range(1, 7)
+SENSE, SEND, DROP, DELIVER, USE, STOP, FORGET = range(1, 8)
 """What an event does to ages; others do nothing."""
 ACTIONS = np.zeros(len(CODES), dtype=np.int64)
 for _kind, _action in (
@@ -23,8 +23,8 @@ for _kind, _action in (
     ("deliver", DELIVER),
     ("absorb", USE),
     ("swap", USE),
-    ("crash", FORGET),
-    ("leave", FORGET),
+    ("crash", STOP),
+    ("leave", STOP),
 ):
     ACTIONS[CODES[_kind]] = _action
 OF_SENDER = np.isin(np.arange(len(CODES)), [CODES["send"], CODES["lost"]])
@@ -150,10 +150,7 @@ class Ages:
         sensed = np.flatnonzero(action == SENSE)
         time[sensed] = self._read_at(ids[sensed], t[sensed])
         action[sensed[np.isnan(time[sensed])]] = 0
-        if self._forgetful.any():
-            action[(action == FORGET) & ~self._forgetful[node]] = 0
-        else:
-            action[action == FORGET] = 0
+        action[(action == STOP) & self._forgetful[node]] = FORGET
         tells_all = np.ones(len(phase), dtype=bool)
         for one in range(int(phase.min(initial=0)), int(phase.max(initial=0)) + 1):
             if not self._tells_all(one):
@@ -224,6 +221,16 @@ def tell(s: AgeState, i: int, k: int, t: float, tells_all: bool) -> None:
 
 
 @kernel
+def clear(s: AgeState, i: int) -> None:
+    """Let no message wait for node ``i``."""
+    k = s.inbox[i]
+    while k >= 0:
+        release(s, k)
+        k = s.following[k]
+    s.inbox[i] = -1
+
+
+@kernel
 def use(s: AgeState, i: int, t: float) -> None:
     """Let node ``i`` use the messages that wait for it: all, or in a swap the last one of the last
     sender, which replaces all that it knows.
@@ -238,9 +245,8 @@ def use(s: AgeState, i: int, t: float) -> None:
         for c in range(s.newest.shape[1]):
             if (s.swaps and k == chosen) or (not s.swaps and s.held[k, c] > s.newest[i, c]):
                 renew(s, i, c, s.held[k, c], t)
-        release(s, k)
         k = s.following[k]
-    s.inbox[i] = -1
+    clear(s, i)
 
 
 @kernel
@@ -277,7 +283,9 @@ def follow(
             use(s, i, t)
         elif action[e] == SENSE:
             renew(s, i, s.own[i], t, t)
-        elif action[e] == FORGET:
-            for c in range(s.newest.shape[1]):
+        elif action[e] == STOP or action[e] == FORGET:
+            # What a node had heard and not used when it went down is lost.
+            clear(s, i)
+            for c in range(s.newest.shape[1] if action[e] == FORGET else 0):
                 renew(s, i, c, 0.0, t)
     return len(action)

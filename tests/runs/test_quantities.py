@@ -132,6 +132,8 @@ def ages_by_hand(scenario, log, sources):
                     known[i][s] = time if analysis.swaps else max(known[i][s], time)
                     history[i, s].append((t, known[i][s]))
             waiting[i] = []
+        elif kind == "crash":
+            waiting[i] = []
     mean, worst = {}, {}
     for (i, s), steps in history.items():
         if i != s:
@@ -148,6 +150,9 @@ FILTERS = {
     "swapping": {"filter": {"kind": "gossip"}},
     "samples": {"sensors.0.sampling": {"kind": "poisson", "rate": 1.0}},
     "delayed": {"network.channel.delay": {"kind": "exponential", "mean": 1.0}},
+    "crashes in slots": {
+        "network.lives": [{"kind": "crashes", "nodes": [1, 2], "mean_up": 0.5, "mean_down": 0.1}]
+    },
 }
 
 
@@ -156,6 +161,7 @@ FILTERS = {
 def test_ages_by_hand(case):
     """Messages that combine, replace, are delayed or tell readings only; many in flight."""
     files = {"readings alone": "intermittent_random10", "swaps in slots": "gossip_ring"}
+    files["crashes in slots"] = "push_sum_planar"
     scenario = netkf.load(SCENARIOS / f"{files.get(case, 'poisson_ring')}.toml")
     scenario = scenario.replace(FILTERS.get(case, {}))
     run = netkf.simulate(scenario, seed=4, engine="simpy")

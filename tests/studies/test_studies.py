@@ -354,6 +354,20 @@ def test_theory_finds_the_root_of_the_recursion(build, quantity):
     assert found.value <= root < found.misses < 1.002 * found.value
 
 
+def test_samples_at_random_times_make_theory_a_bound(build):
+    """P is random then, and below the bound on its mean on average: no value is missed by it."""
+    sampled = {"nodes": [0], "H": [[1.0]], "R": [[0.1]], "sampling": {"kind": "poisson", "rate": 1}}
+    plant = {"kind": "diffusion", "A": [[0.2]], "B": [[1.0]], "cov": [[1.0]]}
+    network = {"graph": {"kind": "path", "nodes": 1}}
+    scenario = build(plant=plant, sensors=[sampled], network=network, filter={"kind": "local"})
+    found = size(scenario, "sensors.0.sampling.rate", 0.5, 5.0, "worst_trace<=1", by="theory")
+    assert {probe.by for probe in found.probes} == {"bound"}
+    assert "missed" not in {probe.target for probe in found.probes}
+    assert size(scenario, "sensors.0.R.0.0", 0.1, 1.0, "mean_rms<=1", runs=32).by == "both"
+    with pytest.raises(TheoryError, match="sample at random times"):
+        size(scenario, "sensors.0.R.0.0", 0.1, 1.0, "within_central<=2", runs=32)
+
+
 def test_a_bound_by_theory_is_kept_in_a_simulation_of_its_own(short):
     found = size(short, RATE, 0.5, 50.0, "mean_trace<=3.0", by="theory")
     assert found

@@ -17,6 +17,7 @@ from netkf.network.deliveries import Deliveries, MessageKey
 from netkf.network.losses import Transmission
 from netkf.scenario.reading import from_table
 from netkf.studies.information import (
+    OUTCOMES,
     KeptReadings,
     find_flow,
     match_messages,
@@ -598,3 +599,18 @@ def test_replays_hop_over_the_channels_of_the_run(tmp_path, engine):
     assert found.trace == pytest.approx(run.P[at, 1, 0, 0], rel=1e-12)
     whole = netkf.simulate(sure, seed=2, engine=engine).P[at, 1, 0, 0]
     assert found.what_ifs[-1].trace == pytest.approx(whole, rel=1e-12)
+
+
+def test_what_a_node_heard_before_it_went_down_is_not_used_after(build, tmp_path):
+    (tmp_path / "lives.csv").write_text("t,node,what\n1.1,0,down\n1.15,0,up\n")
+    lives = [{"kind": "recorded", "nodes": [0], "path": "lives.csv"}]
+    network = {"graph": {"kind": "path", "nodes": 2}, "activation": {"kind": "broadcast"}}
+    sensors = [{"nodes": [1], "H": [[1.0]], "R": [[0.3]]}]
+    scenario = build(
+        plant={**SLOTS, "period": 1.0}, sensors=sensors, probe=1.0,
+        network={**network, "lives": lives}, filter={"kind": "intermittent"},
+    )  # fmt: skip
+    log = netkf.simulate(scenario).log
+    messages = match_messages(log, swaps=False, slotted=True)
+    sent = messages.sent[messages.outcome == OUTCOMES.index("unused")]
+    assert sent.tolist() == [1.0]
