@@ -29,9 +29,8 @@ from netkf.runs.documents import (
     write_sealed,
 )
 from netkf.runs.files import (
-    BLOCKS_FOLDER,
     copied_file_names,
-    holds_only,
+    other_files,
     scenario_digest,
     write_atomically,
     write_scenario,
@@ -98,11 +97,10 @@ def clear_unfinished(directory: Path, scenario: Scenario) -> bool:
         return True
     # Files of a run are not in the list: those of a finished run must not be removed.
     names = ["scenario.toml", *FILES, *copied_file_names(scenario)]
-    if (directory / BLOCKS_FOLDER).exists() or not holds_only(
-        directory, [*names, f"{VERDICT}.part"]
-    ):
+    names.append(f"{VERDICT}.part")
+    if other_files(directory, names):
         return False
-    remove_unfinished(directory, scenario, [*names, f"{VERDICT}.part"])
+    remove_unfinished(directory, scenario, names)
     return True
 
 

@@ -20,7 +20,7 @@ from netkf.runs.documents import (
     read_document,
     require_form,
 )
-from netkf.runs.files import create_output_directory, holds_only, remove_files, run_file_names
+from netkf.runs.files import BLOCKS_FOLDER, other_files, remove_files, run_file_names
 from netkf.runs.provenance import machine, versions
 from netkf.scenario.plugins import find_module_files
 from netkf.scenario.scenario import Scenario
@@ -56,8 +56,9 @@ def is_finished(out: Path | None, scenario: Scenario, plan: RunIdentity) -> bool
         remedy = "add --out DIR with the directory of the run that was stopped"
         raise ScenarioError("--resume", "needs the directory of the runs", None, remedy)
     if not (out / "manifest.json").exists():
-        if not _has_own_files(out, scenario):
+        if not out.is_dir() or not any(out.iterdir()):
             return None
+        _require_own_files(out, [*run_file_names(scenario), BLOCKS_FOLDER])
         # Stopped before the manifest was written. Each block names its run: blocks of other runs
         # are removed when they are read.
         _check_scenario(out, scenario)
@@ -107,7 +108,7 @@ def clear_unfinished_runs(
     a line about them. Raises ScenarioError if the directory holds another run.
     """
     if not (directory / "manifest.json").exists():
-        if _has_own_files(directory, scenario):
+        if directory.is_dir() and any(directory.iterdir()):
             remove_unfinished(directory, scenario, run_file_names(scenario))
         return True
     manifest = read_manifest(directory)
@@ -134,8 +135,10 @@ def clear_unfinished_runs(
 def remove_unfinished(directory: Path, scenario: Scenario, names: Collection[str]) -> None:
     """Remove the files ``names`` that a stopped command left in ``directory``.
 
-    Raises ScenarioError if they are of another scenario, or the only copies of what this one reads.
+    Raises ScenarioError, with nothing removed, if they are of another scenario or the only copies
+    of what this one reads, or if there are other files, beside which nothing is written.
     """
+    _require_own_files(directory, names)
     _check_scenario(directory, scenario)
     files = [source.full for source in source_files(scenario)]
     files += [file for file in find_module_files(scenario).values() if file is not None]
@@ -147,14 +150,11 @@ def remove_unfinished(directory: Path, scenario: Scenario, names: Collection[str
     remove_files(directory, names)
 
 
-def _has_own_files(directory: Path, scenario: Scenario) -> bool:
-    """Return True if a directory without a manifest has files, all of a stopped run."""
-    if not directory.is_dir() or not any(directory.iterdir()):
-        return False
-    if not holds_only(directory, run_file_names(scenario)):
-        # Raises the ScenarioError of a directory that is not empty.
-        create_output_directory(directory, scenario.name)
-    return True
+def _require_own_files(directory: Path, names: Collection[str]) -> None:
+    others = other_files(directory, names)
+    if others:
+        rule, found = f"{directory} holds what is not of the run", ", ".join(others[:3])
+        raise ScenarioError("--resume", rule, found, "move it away, or give a new directory")
 
 
 def _check_scenario(directory: Path, scenario: Scenario) -> None:

@@ -221,14 +221,15 @@ def copied_file_names(scenario: Scenario) -> list[str]:
     return [*modules, *(source.name for source in source_files(scenario))]
 
 
-def holds_only(directory: Path, names: Collection[str]) -> bool:
-    """Return True if a directory holds nothing but ``names``, their temporary files and stored
-    blocks, so that clearing it loses nothing of the user's.
+def other_files(directory: Path, names: Collection[str]) -> list[str]:
+    """Return what a directory holds beside ``names``, files and whole folders, and their temporary
+    files, by name.
     """
-    allowed = {*names, *(f"{name}.part" for name in names), BLOCKS_FOLDER}
+    allowed = {*names, *(f"{name}.part" for name in names)}
     allowed |= {str(folder) for name in names for folder in Path(name).parents}
-    present = (path.relative_to(directory).as_posix() for path in directory.rglob("*"))
-    return all(name in allowed or name.startswith(f"{BLOCKS_FOLDER}/") for name in present)
+    present = (path.relative_to(directory) for path in directory.rglob("*"))
+    found = (path.as_posix() for path in present if path.parts[0] not in names)
+    return sorted(set(found) - allowed)
 
 
 def file_digest(path: Path) -> str:

@@ -391,14 +391,17 @@ def test_what_cannot_be_resumed_is_refused(tmp_path, capsys):
     assert "add --runs R" in capsys.readouterr().err
 
 
-def test_a_single_run_that_was_killed_is_done_again(tmp_path):
+def test_a_single_run_that_was_killed_is_done_again(tmp_path, capsys):
     assert run(tmp_path, "whole") == 0
     assert run(tmp_path, "cut") == 0
     manifest = tmp_path / "cut" / "manifest.json"
     manifest.write_text(manifest.read_text().replace("complete", "interrupted"))
     (tmp_path / "cut" / "states.parquet").unlink()
     (tmp_path / "cut" / "notes.txt").touch()
+    kept = files(tmp_path / "cut")
     assert run(tmp_path, "cut", "--resume") == 2
+    assert "notes.txt'; move it away" in capsys.readouterr().err
+    assert files(tmp_path / "cut") == kept  # a refusal removes nothing
     (tmp_path / "cut" / "notes.txt").unlink()
     assert run(tmp_path, "cut", "--resume") == 0
     assert files(tmp_path / "cut") == files(tmp_path / "whole")
