@@ -48,7 +48,8 @@ class Backwards(Executor):
     """Does what it got last first, and does not tell its number of workers."""
 
     def __init__(self):
-        self.waiting, self.thread = queue.LifoQueue(), threading.Thread(target=self.serve)
+        self.waiting = queue.LifoQueue()
+        self.thread = threading.Thread(target=self.serve, daemon=True)
         self.thread.start()
 
     def submit(self, function, /, *arguments):
