@@ -33,24 +33,24 @@ class LossLaw(NamedTuple):
     lost        : (D,) long-run probability that a message is lost, nan if unknown
     independent : messages are lost independently of each other
     chain       : the two-state chain that makes one step with each message, None without one
+    opposite    : (D,) index of the opposite direction, -1 without one
+    links       : the directions, (sender, receiver)
     steady      : all messages of a link are lost with one probability
     symmetric   : both messages of an exchange may share one draw
     shared      : some of them do, so that each draw is counted twice
-    opposite    : (D,) index of the opposite direction, -1 without one
     at_once     : both directions carry messages at once and draw their own losses
-    links       : the directions, (sender, receiver)
     share       : probability that all hearers of a broadcast have one fate
     """
 
     lost: FloatArray
     independent: bool
     chain: Chain | None
-    steady: bool
-    symmetric: bool
-    shared: bool
     opposite: np.ndarray
-    at_once: bool
     links: Sequence[tuple[int, int]]
+    steady: bool = False
+    symmetric: bool = False
+    shared: bool = False
+    at_once: bool = False
     share: float = 0.0
 
     @property

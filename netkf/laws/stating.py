@@ -69,3 +69,13 @@ def stated_law(part: Any, family: str) -> Any:
     if own and name not in own:
         return getattr(CONTRACTS[family], name).fget(stated)
     return getattr(stated, name)
+
+
+def stating_class(part: Any, family: str, statement: str) -> str:
+    """Return what states the law of a part, as text: the class it derives from, or its own
+    ``statement``.
+    """
+    stated = stated_part(part, family)
+    if type(stated) is type(part):
+        return f"its `{statement}`"
+    return f"{type(stated).__name__}, from which it derives"

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from itertools import compress
 from typing import Any
 
 import numpy as np
+import scipy.stats
 
-from netkf.laws.delays import DelayCounts, compare_delays, count_delays
+from netkf.laws import stack_runs
+from netkf.laws.delays import compare_delays, count_delays
 from netkf.laws.losses import (
     LossLaw,
     compare_bursts,
@@ -18,16 +21,22 @@ from netkf.laws.losses import (
     count_outcomes,
 )
 from netkf.laws.noise import compare_with
-from netkf.laws.stating import stated_law, stated_part
+from netkf.laws.stating import stated_law, stated_part, stating_class
 from netkf.network.channels import BroadcastSampler, Channel, ChannelSampler, conditions_of
 from netkf.network.delays import Delay
 from netkf.network.delays import delay_depends_on_message as overrides_message_delay
 from netkf.network.graphs import Complete, Link, Topology
 from netkf.network.losses import Loss, Transmission, delivery_probabilities, has_conditions
 from netkf.rng.streams import Streams
-from netkf.testing.generators import RecordingGenerator, describe_calls
+from netkf.testing.generators import Calls, RecordingGenerator, describe_calls
 from netkf.testing.noise import demand_agreement, family_level
-from netkf.testing.watching import WatchedPart, demand, fail, guard_user_code, make_part
+from netkf.testing.watching import (
+    OTHER_GENERATOR,
+    WatchedPart,
+    guard_user_code,
+    is_number,
+    make_part,
+)
 
 CHAINS, LENGTH = 400, 50
 """Simulated runs, and messages over each directed link in a run."""
@@ -86,21 +95,18 @@ def _check_channel(part: Any, topology: Topology | None, seed: int) -> None:
         return
     watched = WatchedPart(part)
     watched.pickle_copy()
-    graph = Complete(nodes=4).build(seed=0) if topology is None else topology
-    links = table_entries(graph)
+    links = table_entries(Complete(nodes=4).build(seed=0) if topology is None else topology)
     if isinstance(part, Delay):
         _check_message_delays(watched, tuple(links))
-        delays, repeated = (_draw_delays(watched) for _ in range(2))
-        rule, got = (
-            "must use no generator but the one it is given",
-            "other delays from an equal generator",
-        )
-        demand(delays == repeated, f"{watched.name}.draw", rule, got)
+        _draw_alike(watched, "draw", "for each message", lambda random, _: _draw(watched, random))
         if part.is_random:
             _check_draws(watched)
         _check_delay_law(watched, tuple(links))
         return
-    conditions = _check_conditions(watched)
+    conditions = None
+    if has_conditions(part):
+        draw = partial(watched.call, "conditions", repeatable=False)
+        conditions = watched.repeat("conditions", lambda random: draw(random, HORIZON))
     near = DISTANCES[0] if part.follows_distance else math.nan
     sent = [
         Transmission(link, table_probability=p, distance=near, conditions=conditions)
@@ -121,17 +127,27 @@ def table_entries(topology: Topology) -> dict[Link, float]:
     return {link: TABLE[k % len(TABLE)] for k, link in enumerate(topology.directions)}
 
 
-def _check_conditions(watched: WatchedPart) -> Any:
-    """Return the conditions of a run, which must depend on the generator alone."""
-    if not has_conditions(watched.part):
-        return None
-    where, drawn = f"{watched.name}.conditions", []
-    for _ in range(2):
-        random = np.random.default_rng(5)
-        drawn.append(watched.call("conditions", random, HORIZON, repeatable=False))
-    rule = "must use no generator but the one it is given"
-    demand(repr(drawn[0]) == repr(drawn[1]), where, rule, "others from an equal generator")
-    return drawn[0]
+def _draw_alike(
+    watched: WatchedPart, method: str, each: str, step: Callable[[RecordingGenerator, Any], Any]
+) -> Calls:
+    """Return the calls of a generator that every ``step``, after the one before, must make."""
+    first_calls: Calls = []
+
+    def draw(random: RecordingGenerator) -> list[Any]:
+        results: list[Any] = [None]
+        for k in range(DRAWS):
+            results.append(step(random, results[-1]))
+            calls = random.take_calls()
+            first_calls[:] = first_calls if k else calls
+            got = (
+                f"{describe_calls(first_calls)} at first and {describe_calls(calls)} at number {k}"
+            )
+            rule, remedy = f"must draw the same {each}", "draw first, then decide"
+            watched.demand(method, calls == first_calls, rule, got, remedy)
+        return results
+
+    watched.repeat(method, draw)
+    return first_calls
 
 
 def _messages(one: Transmission) -> list[Transmission]:
@@ -144,28 +160,24 @@ def _messages(one: Transmission) -> list[Transmission]:
 
 
 def _check_pure(watched: WatchedPart, sent: list[Transmission]) -> None:
+    method, remedy = "delivery_probability", "use nothing but the arguments"
     calls = [message for one in sent for message in _messages(one)]
-    probability, where = watched.part.delivery_probability, f"{watched.name}.delivery_probability"
+    probability = watched.part.delivery_probability
     forwards = [float(probability(call)) for call in calls]
     backwards = [float(probability(call)) for call in reversed(calls)][::-1]
+    rule = "must not depend on which links and messages were asked for before"
     for call, first, second in zip(calls, forwards, backwards, strict=True):
-        demand(
-            first == second,
-            where,
-            "must not depend on which links and messages were asked for before",
-            f"{first:.4g} and {second:.4g} for message {call.number} of link {list(call.link)}",
-            "use nothing but the arguments",
-        )
-    per_link = np.reshape(forwards, (len(sent), -1))
-    for one, expected in zip(sent, per_link, strict=True):
+        got = f"{first:.4g} and {second:.4g} for message {call.number} of link {list(call.link)}"
+        watched.demand(method, first == second, rule, got, remedy)
+    rule = "must give many messages the probabilities of each, where the class is vectorised"
+    for one, expected in zip(sent, np.reshape(forwards, (len(sent), -1)), strict=True):
         number, time, bad = np.transpose([(m.number, m.time, m.bad) for m in _messages(one)])
         many = one._replace(number=number.astype(int), time=time, bad=bad.astype(bool))
-        with guard_user_code(where):
+        with guard_user_code(f"{watched.name}.{method}"):
             together = delivery_probabilities(watched.part, many)
-        rule = "must give many messages the probabilities of each, where the class is vectorised"
         off = np.flatnonzero(together != expected)
-        got = [f"{together[k]:.4g} and {expected[k]:.4g}" for k in off[:1].tolist()]
-        demand(not off.size, where, rule, "".join(got), "use operations of numpy on whole arrays")
+        got = "".join(f"{together[k]:.4g} and {expected[k]:.4g}" for k in off[:1])
+        watched.demand(method, not off.size, rule, got, "use operations of numpy on whole arrays")
 
 
 def _check_identical_links(watched: WatchedPart, sent: list[Transmission]) -> None:
@@ -177,91 +189,75 @@ def _check_identical_links(watched: WatchedPart, sent: list[Transmission]) -> No
     )
     if mean_owner <= probability_owner and ancestors[mean_owner] is not Loss:
         return
-    for bad in (False, True):
-        for message in MESSAGES:
-            alike = [one._replace(number=message, bad=bad, table_probability=0.8) for one in sent]
-            probabilities = [float(part.delivery_probability(one)) for one in alike]
-            median = float(np.median(probabilities))
-            for (link, *_), probability in zip(sent, probabilities, strict=True):
-                demand(
-                    abs(probability - median) <= PROBABILITY_TOLERANCE,
-                    f"{watched.name}.delivery_probability",
-                    "must be the same for links with equal entries in the graph's table",
-                    f"{probability:.4g} for link {list(link)} and {median:.4g} for others",
-                    "define mean_delivery beside it if links differ by design",
-                )
+    rule = "must be the same for links with equal entries in the graph's table"
+    remedy = "define mean_delivery beside it if links differ by design"
+    for message in _messages(Transmission((0, 1))):
+        alike = [m._replace(number=message.number, bad=message.bad) for m in sent]
+        found = [float(part.delivery_probability(m._replace(table_probability=0.8))) for m in alike]
+        median = float(np.median(found))
+        for (link, *_), probability in zip(sent, found, strict=True):
+            is_same = abs(probability - median) <= PROBABILITY_TOLERANCE
+            got = f"{probability:.4g} for link {list(link)} and {median:.4g} for others"
+            watched.demand("delivery_probability", is_same, rule, got, remedy)
 
 
 def _check_delivery_probabilities(watched: WatchedPart, one: Transmission) -> None:
-    part, where = watched.part, f"{watched.name}.delivery_probability"
+    part, method = watched.part, "delivery_probability"
     for distance in DISTANCES if part.follows_distance else (one.distance,):
         for message in _messages(one._replace(distance=distance)):
-            probability = watched.call("delivery_probability", message)
-            is_number = isinstance(probability, (int, float, np.floating)) or (
+            probability = watched.call(method, message)
+            known = is_number(probability) or (
                 isinstance(probability, np.ndarray) and probability.shape == ()
             )
             subject = f"for message {message.number}"
             if part.follows_distance:
                 subject = f"at the distance {distance:g}"
             rule = f"must be a number from 0 to 1 {subject}"
-            demand(is_number and 0.0 <= probability <= 1.0, where, rule, probability)
-            rule = "must be 0 or 1 where the loss is deterministic"
-            got = probability
-            remedy = "let deterministic be False"
-            demand(not part.deterministic or probability in (0.0, 1.0), where, rule, got, remedy)
+            watched.demand(method, known and 0.0 <= probability <= 1.0, rule, probability)
+            rule, remedy = (
+                "must be 0 or 1 where the loss is deterministic",
+                "let deterministic be False",
+            )
+            is_sure = not part.deterministic or probability in (0.0, 1.0)
+            watched.demand(method, is_sure, rule, probability, remedy)
     mean = watched.call("mean_delivery", one)
     is_mean = math.isnan(mean) or 0.0 <= mean <= 1.0
-    demand(is_mean, f"{watched.name}.mean_delivery", "must be a number from 0 to 1, or nan", mean)
+    watched.demand("mean_delivery", is_mean, "must be a number from 0 to 1, or nan", mean)
 
 
 def _check_channel_state(watched: WatchedPart) -> None:
-    part, where = watched.part, f"{watched.name}.next_state"
-    histories: list[list[Any]] = []
-    for _ in range(2):
-        random, bad, history = RecordingGenerator(5), None, []
-        for k in range(DRAWS):
-            bad = watched.call("next_state", (0, 1), bad, random, repeatable=False)
-            demand(bad is True or bad is False, where, "must be True or False", bad)
-            calls = random.take_calls()
-            history.append((bad, calls))
-            if not part.stateful:
-                rule = "must draw nothing where stateful is False"
-                demand(not calls, where, rule, describe_calls(calls), "let stateful be True")
-            elif calls != history[0][1]:
-                fail(
-                    where,
-                    "must draw the same at each activation",
-                    f"{describe_calls(history[0][1])} at the first and {describe_calls(calls)} at "
-                    f"number {k}",
-                    "draw first, then decide",
-                )
-        histories.append(history)
-    rule = "must use no generator but the one it is given"
-    demand(histories[0] == histories[1], where, rule, "another outcome from an equal generator")
+    method = "next_state"
+
+    def step(random: RecordingGenerator, before: Any) -> Any:
+        bad = watched.call(method, (0, 1), before, random, repeatable=False)
+        watched.demand(method, bad is True or bad is False, "must be True or False", bad)
+        return bad
+
+    calls = _draw_alike(watched, method, "at each activation", step)
+    rule, remedy = "must draw nothing where stateful is False", "let stateful be True"
+    is_silent = watched.part.stateful or not calls
+    watched.demand(method, is_silent, rule, describe_calls(calls), remedy)
 
 
 def _check_fractions(watched: WatchedPart, links: dict[Link, float], seed: int) -> None:
-    part, where = watched.part, f"{watched.name}.mean_delivery"
-    stated = np.array(
-        [
-            part.mean_delivery(Transmission(link, table_probability=p, distance=DISTANCES[0]))
-            for link, p in links.items()
-        ]
-    )
+    part = watched.part
+    sent = [
+        Transmission(link, table_probability=p, distance=DISTANCES[0]) for link, p in links.items()
+    ]
+    stated = np.array([part.mean_delivery(one) for one in sent])
     if np.isnan(stated).all() and not part.independent:
         return
     with guard_user_code(watched.name):
-        lost = _simulate_losses(part, links, seed)
+        lost = _simulate_losses(part, sent, seed)
     # Links have streams of their own.
-    chain, none, known = stated_law(part, "loss"), np.full(len(links), -1), ~np.isnan(stated)
-    law = LossLaw(
-        1.0 - stated, part.independent, chain, False, False, False, none, False, tuple(links)
-    )
+    none, known = np.full(len(links), -1), ~np.isnan(stated)
+    law = LossLaw(1.0 - stated, part.independent, stated_law(part, "loss"), none, tuple(links))
     if known.any():
         counts = count_outcomes(lost[..., known], none[known])
         of_known = law._replace(lost=law.lost[known], links=list(compress(links, known)))
         shares = compare_losses(of_known, counts, family_level())
-        demand_agreement(shares, where, "must be the delivered fraction in the long run")
+        rule = "must be the delivered fraction in the long run"
+        demand_agreement(shares, f"{watched.name}.mean_delivery", rule)
     if part.independent:
         rule = "must be False where outcomes of neighbouring activations or links are related"
         labels = [str(list(link)) for link in links]
@@ -269,58 +265,45 @@ def _check_fractions(watched: WatchedPart, links: dict[Link, float], seed: int) 
         remedy = "return False: theory relies on it"
         demand_agreement(coincidences, f"{watched.name}.independent", rule, remedy)
     elif law.chain is not None and known.all():
-        stated = stated_part(part, "loss")
-        derives = type(stated) is not type(part)
-        parent = f"{type(stated).__name__}, from which it derives" if derives else "its `chain`"
-        bursts = compare_bursts(law, count_outcomes(lost, law.opposite), family_level())
-        rule = f"losses must follow each other as in {parent}"
+        bursts = compare_bursts(law, count_outcomes(lost, none), family_level())
+        rule = f"losses must follow each other as in {stating_class(part, 'loss', 'chain')}"
         remedy = "define mean_delivery too if it differs by design"
         demand_agreement(bursts, f"{watched.name}.next_state", rule, remedy)
 
 
-def _simulate_losses(part: Loss, links: dict[Link, float], seed: int) -> np.ndarray:
+def _simulate_losses(part: Loss, sent: list[Transmission], seed: int) -> np.ndarray:
     """Return the mask (CHAINS, LENGTH, L) of messages that the engine would lose."""
-    lost, channel = np.zeros((CHAINS, LENGTH, len(links)), dtype=bool), Channel(loss=part)
+    lost, channel = np.zeros((CHAINS, LENGTH, len(sent)), dtype=bool), Channel(loss=part)
     times = np.linspace(0.0, HORIZON, LENGTH, endpoint=False)
     for chain in range(CHAINS):
         streams = Streams(seed + 7, chain)
         conditions = conditions_of(part, streams, HORIZON)
-        for k, (link, table_probability) in enumerate(links.items()):
-            sampler = ChannelSampler(channel, link, partial(_stream, streams, link))
+        for k, one in enumerate(sent):
+            sampler = ChannelSampler(channel, one.link, partial(_stream, streams, one.link))
             uniform, bad, _ = sampler.draws(LENGTH)
-            if part.state_of == "sender":
-                bad = (
-                    BroadcastSampler(part, link, False, partial(_stream, streams, link[:1]))
-                    .draws(LENGTH)
-                    .bad
-                )
-            sent = Transmission(
-                link, np.arange(LENGTH), times, bad, table_probability, DISTANCES[0],
-                conditions=conditions,
-            )  # fmt: skip
-            lost[chain, :, k] = uniform >= delivery_probabilities(part, sent)
+            of_sender = partial(_stream, streams, one.link[:1])
+            shared = BroadcastSampler(part, one.link, False, of_sender).draws(LENGTH).bad
+            many = one._replace(number=np.arange(LENGTH), time=times, conditions=conditions)
+            many = many._replace(bad=bad if shared is None else shared)
+            lost[chain, :, k] = uniform >= delivery_probabilities(part, many)
     return lost
 
 
-def _stream(streams: Streams, link: tuple[int, ...], purpose: str) -> np.random.Generator:
-    return streams.generator(purpose, *link)
+def _stream(streams: Streams, entity: tuple[int, ...], purpose: str) -> np.random.Generator:
+    return streams.generator(purpose, *entity)
 
 
 def _check_delay_law(watched: WatchedPart, links: tuple[Link, ...]) -> None:
-    stated, part = stated_part(watched.part, "delay"), watched.part
-    where = f"{watched.name}.message_delay"
-    derives, law = type(stated) is not type(part), stated_law(part, "delay")
-    parent = f"{type(stated).__name__}, from which it derives" if derives else "its `law`"
-    rule, remedy = (
-        f"delays must have the law of {parent}",
-        "define longest too if it differs by design",
-    )
-    if stated.fixed is not None and derives:
+    stated, part, method = stated_part(watched.part, "delay"), watched.part, "message_delay"
+    law, where = stated_law(part, "delay"), f"{watched.name}.message_delay"
+    rule = f"delays must have the law of {stating_class(part, 'delay', 'law')}"
+    remedy = "define longest too if it differs by design"
+    if stated.fixed is not None and stated is not part:
         for link in links:
             seconds = part.message_delay(Transmission(link), stated.fixed)
             is_equal = math.isnan(seconds) or seconds == stated.fixed
             got = f"{seconds:g} s for link {list(link)} instead of {stated.fixed:g}"
-            demand(is_equal, where, rule, got, remedy)
+            watched.demand(method, is_equal, rule, got, remedy)
         return
     if law is None:
         return
@@ -331,82 +314,60 @@ def _check_delay_law(watched: WatchedPart, links: tuple[Link, ...]) -> None:
             part.message_delay(Transmission(links[index], k), part.draw(random))
             for k, index in enumerate(directions.tolist())
         ]
-    sent = np.zeros(len(delays))
     if np.isnan(delays).any():  # messages that the delay loses have no law
         return
+    sent = np.zeros(len(delays))
     counts = count_delays(law, sent, np.array(delays), directions, len(links), FOREVER)
-    several = DelayCounts(*(count[None] for count in counts))
-    for comparison in compare_delays(several, links, 2.0 * family_level()):
+    for comparison in compare_delays(stack_runs([counts]), links, 2.0 * family_level()):
         demand_agreement(comparison, where, rule, remedy)
 
 
 def _check_draws(watched: WatchedPart) -> None:
-    where = f"{watched.name}.draw"
+    where, part = f"{watched.name}.draw", watched.part
     with guard_user_code(where):
         random, other_random = (Streams(6, k).generator("delay") for k in range(2))
-        delays = np.array([watched.part.draw(random) for _ in range(DELAYS)])
-        others = np.array([watched.part.draw(other_random) for _ in range(DRAWS)])
-    varies = delays.std() > 1e-9 * (1.0 + np.abs(delays).max())
-    is_same = varies and np.array_equal(delays[:DRAWS], others)
-    rule = "must draw from the generator given"
-    demand(not is_same, where, rule, "equal delays from two generators")
-    from scipy.stats import rankdata
-
+        delays = np.array([part.draw(random) for _ in range(DELAYS)])
+        others = np.array([part.draw(other_random) for _ in range(DRAWS)])
+    if delays.std() <= 1e-9 * (1.0 + np.abs(delays).max()):
+        return
+    is_same, got = np.array_equal(delays[:DRAWS], others), "equal delays from two generators"
+    watched.demand("draw", not is_same, OTHER_GENERATOR, got)
     # Ranks, so that long tails do not hide a correlation; equal delays have equal ranks.
-    centred = (rankdata(delays) - 0.5) / len(delays) - 0.5
-    if varies:
-        one, other = centred[1:, None], centred[:-1, None]
-        rule = "delays of neighbouring messages must be independent"
-        demand_agreement(
-            compare_with(one, other, ["a delay"], ["the one before"], family_level()), where, rule
-        )
+    centred = (scipy.stats.rankdata(delays) - 0.5)[:, None] / len(delays) - 0.5
+    names = ["a delay"], ["the one before"]
+    comparison = compare_with(centred[1:], centred[:-1], *names, family_level())
+    demand_agreement(comparison, where, "delays of neighbouring messages must be independent")
 
 
 def _check_message_delays(watched: WatchedPart, links: tuple[Link, ...]) -> None:
-    part, where, longest = watched.part, f"{watched.name}.message_delay", watched.part.longest
+    part, method, longest = watched.part, "message_delay", watched.part.longest
     drawn_delay = part.fixed or 0.0
     calls = [Transmission(link, number) for link in links for number in MESSAGES]
-    delays = [watched.call("message_delay", call, drawn_delay) for call in calls]
+    delays = [watched.call(method, call, drawn_delay) for call in calls]
     for (link, message, *_), seconds in zip(calls, delays, strict=True):
         subject = f"message {message} of link {list(link)}"
-        is_number = isinstance(seconds, (int, float, np.floating))
-        demand(is_number, where, f"must be a number for {subject}", seconds)
-        in_range = math.isnan(seconds) or 0.0 <= seconds <= longest
+        watched.demand(method, is_number(seconds), f"must be a number for {subject}", seconds)
+        in_range, got = (
+            math.isnan(seconds) or 0.0 <= seconds <= longest,
+            f"{seconds:g} for {subject}",
+        )
         rule = f"must be from 0 to `longest` ({longest:g}) seconds, or nan where it is lost"
-        demand(in_range, where, rule, f"{seconds:g} for {subject}")
+        watched.demand(method, in_range, rule, got)
         is_fixed = part.fixed is None or seconds == drawn_delay or overrides_message_delay(part)
-        demand(is_fixed, where, "must be `fixed` where delays are", f"{seconds:g} for {subject}")
+        watched.demand(method, is_fixed, "must be `fixed` where delays are", got)
     # The same calls again, in reverse order.
+    rule = "must not depend on which messages were asked for before"
     for call, first in zip(reversed(calls), reversed(delays), strict=True):
         second = part.message_delay(call, drawn_delay)
         is_equal = second == first or (math.isnan(second) and math.isnan(first))
-        rule = "must not depend on which messages were asked for before"
-        demand(is_equal, where, rule, f"{first:g} and {second:g}")
+        watched.demand(method, is_equal, rule, f"{first:g} and {second:g}")
 
 
-def _draw_delays(watched: WatchedPart) -> list[float]:
-    fixed, where, random = watched.part.fixed, f"{watched.name}.draw", RecordingGenerator(6)
-    first_calls, rule = None, "must be a finite number of at least 0 seconds"
-    delays: list[float] = []
-    for k in range(DRAWS):
-        seconds = watched.call("draw", random, repeatable=False)
-        is_number = isinstance(seconds, (int, float, np.floating)) and math.isfinite(seconds)
-        demand(is_number and seconds >= 0.0, where, rule, seconds, "shift or clip the law")
-        calls = random.take_calls()
-        first_calls = calls if first_calls is None else first_calls
-        demand(
-            calls == first_calls,
-            where,
-            "must draw the same for each message",
-            f"{describe_calls(first_calls)} for the first and {describe_calls(calls)} for number "
-            f"{k}",
-            "draw a fixed number of values, then decide",
-        )
-        demand(
-            fixed is None or seconds == fixed,
-            f"{watched.name}.fixed",
-            "must be what draw returns, or None",
-            f"{fixed} for {seconds}",
-        )
-        delays.append(seconds)
-    return delays
+def _draw(watched: WatchedPart, random: RecordingGenerator) -> float:
+    fixed, seconds = watched.part.fixed, watched.call("draw", random, repeatable=False)
+    rule, remedy = "must be a finite number of at least 0 seconds", "shift or clip the law"
+    is_right = is_number(seconds) and 0.0 <= seconds < math.inf
+    watched.demand("draw", is_right, rule, seconds, remedy)
+    is_fixed, got = fixed is None or seconds == fixed, f"{fixed} for {seconds}"
+    watched.demand("fixed", is_fixed, "must be what draw returns, or None", got)
+    return float(seconds)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from functools import partial
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -12,9 +14,10 @@ from scipy.special import ndtri
 from netkf.core.clock import ClockPosition, Entity, generate_ticks
 from netkf.core.errors import ScenarioError
 from netkf.core.laws import EXPONENTIAL, Lattice
+from netkf.laws import stack_runs
 from netkf.laws.intervals import Comparison, deviation_interval
 from netkf.laws.noise import compare_correlations
-from netkf.laws.stating import stated_law, stated_part
+from netkf.laws.stating import stated_law, stating_class
 from netkf.laws.ticks import (
     ClockGroup,
     TickCounts,
@@ -31,7 +34,14 @@ from netkf.network.graphs import Complete, Link
 from netkf.rng.streams import Streams
 from netkf.testing.generators import RecordingGenerator
 from netkf.testing.noise import demand_agreement, family_level
-from netkf.testing.watching import WatchedPart, demand, fail, guard_user_code, make_part
+from netkf.testing.watching import (
+    OTHER_GENERATOR,
+    WatchedPart,
+    demand_vector,
+    guard_user_code,
+    is_number,
+    make_part,
+)
 
 BLOCKS = ((600,), (1,) * 600, (7, 64, 1, 256, 272))
 """Ways to ask for 600 ticks: the number of ticks in each block."""
@@ -44,7 +54,6 @@ INTERLEAVED_TICKS = 40
 """Ticks of each entity that are compared alone and with ticks of other entities in between."""
 
 
-REMEDY = "use the generator given"
 STATE_IT = "define mean_rate and memoryless too if it differs by design"
 
 
@@ -77,8 +86,7 @@ def _check_clock(part: Any, link: Link | None, seed: int) -> None:
     watched = WatchedPart(part)
     watched.pickle_copy()
     entities = _all_entities(part) if link is None else (link,)
-    for entity in entities[:1] if link is None else entities:
-        _check_entity(watched, entity)
+    _check_entity(watched, entities[0])
     _check_interleaved(watched, entities)
     # Rates and laws need a clock that does not stop.
     if len(_read_ticks(watched, entities[0], BLOCKS[0])) == sum(BLOCKS[0]):
@@ -100,181 +108,153 @@ def _all_entities(part: Any) -> tuple[Entity, ...]:
 
 
 def _check_entity(watched: WatchedPart, entity: Entity) -> None:
-    _check_origin(watched, entity)
-    in_one_block = _read_ticks(watched, entity, BLOCKS[0])
-    _check_increasing(watched, in_one_block)
-    repeated = _read_ticks(watched, entity, BLOCKS[0])
-    rule = "must use no generator but the one it is given"
-    got = "other times from an equal generator"
-    demand(np.array_equal(in_one_block, repeated), f"{watched.name}.ticks", rule, got)
+    call = partial(watched.call, "origin", entity, repeatable=False)
+    origin = watched.repeat("origin", lambda random: call(lambda: random))
+    is_finite = is_number(origin) and math.isfinite(origin)
+    watched.demand("origin", is_finite, "must be a finite number", origin)
+    read = partial(_read_ticks, watched, entity)
+    one = watched.repeat("ticks", lambda random: read(BLOCKS[0], random))
+    _check_increasing(watched, one)
+    rule = "must not depend on the size of the blocks"
     for blocks in BLOCKS[1:]:
-        in_blocks = _read_ticks(watched, entity, blocks)
-        if not np.array_equal(in_one_block, in_blocks):
-            pairs = zip(in_one_block, in_blocks, strict=False)
-            shorter = min(len(in_one_block), len(in_blocks))
-            k = next((k for k, (one, other) in enumerate(pairs) if one != other), shorter)
-            texts = [f"{t[k]:.17g}" if k < len(t) else "nothing" for t in (in_one_block, in_blocks)]
-            fail(
-                f"{watched.name}.ticks",
-                "must not depend on the size of the blocks",
-                f"{texts[0]} as tick {k} of one block and {texts[1]} in blocks of {blocks[0]}, ...",
-                "add gaps up one by one from now, one draw a tick",
-            )
+        other = read(blocks)
+        differ = one[: len(other)] != other[: len(one)]
+        k = int(np.argmax(differ)) if differ.any() else len(differ)
+        texts = [f"{t[k]:.17g}" if k < len(t) else "nothing" for t in (one, other)]
+        got = f"{texts[0]} as tick {k} of one block and {texts[1]} in blocks of {blocks[0]}, ..."
+        remedy = "add gaps up one by one from now, one draw a tick"
+        watched.demand("ticks", np.array_equal(one, other), rule, got, remedy)
 
 
 def _check_interleaved(watched: WatchedPart, entities: tuple[Entity, ...]) -> None:
-    part, where = watched.part, f"{watched.name}.ticks"
-    with guard_user_code(where):
-        alone = [list(_iterate_ticks(part, entity, k)) for k, entity in enumerate(entities)]
+    with guard_user_code(f"{watched.name}.ticks"):
+        iterate = partial(_iterate_ticks, watched.part)
+        alone = [list(iterate(entity, k)) for k, entity in enumerate(entities)]
         # The same streams again, with the ticks of all entities drawn in turn.
-        iterators = [_iterate_ticks(part, entity, k) for k, entity in enumerate(entities)]
-        interleaved: list[list[float]] = [[] for _ in entities]
-        for _ in range(INTERLEAVED_TICKS):
-            for ticks, iterator in zip(interleaved, iterators, strict=True):
-                tick = next(iterator, None)
-                if tick is not None:
-                    ticks.append(tick)
-    for k, entity in enumerate(entities):
-        rule = "ticks of a link must not depend on those of others"
+        turns = zip_longest(*(iterate(entity, k) for k, entity in enumerate(entities)))
+        interleaved = [[t for t in ticks if t is not None] for ticks in zip(*turns, strict=True)]
+    rule = "ticks of a link must not depend on those of others"
+    for entity, one, other in zip(entities, alone, interleaved, strict=False):
         got = f"other times of {list(entity)} when other links tick in between"
         remedy = "use the generator given, and no memory of earlier calls"
-        demand(interleaved[k] == alone[k], where, rule, got, remedy)
+        watched.demand("ticks", one == other, rule, got, remedy)
 
 
 def _iterate_ticks(part: Any, entity: Entity, stream: int) -> Iterator[float]:
     random = RecordingGenerator(11, stream)
     position = ClockPosition(float(part.origin(entity, lambda: RecordingGenerator(12, stream))))
-    for _ in range(INTERLEAVED_TICKS):
+    for number in range(INTERLEAVED_TICKS):
         block = part.ticks(entity, *position, random, 1)
         if not len(block):
             return
-        tick = float(block[0])
-        yield tick
-        position = position._replace(number=position.number + 1, now=tick)
+        position = position._replace(number=number + 1, now=float(block[0]))
+        yield position.now
 
 
-def _check_origin(watched: WatchedPart, entity: Entity) -> None:
-    first, second = (
-        watched.call("origin", entity, lambda: RecordingGenerator(8), repeatable=False)
-        for _ in range(2)
-    )
-    where = f"{watched.name}.origin"
-    is_number = isinstance(first, (int, float, np.floating)) and math.isfinite(first)
-    demand(is_number, where, "must be a finite number", first)
-    demand(first == second, where, "must use no generator but the one it is given", [first, second])
-
-
-def _read_ticks(watched: WatchedPart, entity: Entity, blocks: tuple[int, ...]) -> FloatArray:
-    random = RecordingGenerator(9)
+def _read_ticks(
+    watched: WatchedPart,
+    entity: Entity,
+    blocks: tuple[int, ...],
+    random: np.random.Generator | None = None,
+) -> FloatArray:
+    random = random or RecordingGenerator(5)
     origin = watched.part.origin(entity, lambda: RecordingGenerator(10))
-    where, now, has_stopped = f"{watched.name}.ticks", 0.0, False
-    times: list[FloatArray] = []
+    times, has_stopped = np.empty(0), False
     for count in blocks:
-        index = sum(len(block) for block in times)
-        block = np.asarray(
-            watched.call("ticks", entity, origin, index, now, random, count, repeatable=False)
-        )
-        is_vector = block.ndim == 1 and block.dtype == np.float64
-        demand(is_vector, where, "must be a vector of float64", f"{block.dtype} {block.shape}")
-        demand(len(block) <= count, where, f"must be at most {count} times", len(block))
-        rule = "an empty block means stopped for good"
-        demand(not (has_stopped and len(block)), where, rule, f"{len(block)} more ticks after it")
+        now = float(times[-1]) if len(times) else 0.0
+        place = entity, origin, len(times), now, random, count
+        block = watched.call("ticks", *place, repeatable=False)
+        block = demand_vector(f"{watched.name}.ticks", block)
+        rule = f"must be at most {count} times"
+        watched.demand("ticks", len(block) <= count, rule, len(block))
+        rule, got = "an empty block means stopped for good", f"{len(block)} more ticks after it"
+        watched.demand("ticks", not (has_stopped and len(block)), rule, got)
         has_stopped = not len(block)
-        times.append(block)
-        now = float(block[-1]) if len(block) else now
-    return np.concatenate(times)
+        times = np.concatenate([times, block])
+    return times
 
 
 def _check_increasing(watched: WatchedPart, times: FloatArray) -> None:
-    where = f"{watched.name}.ticks"
     rule, remedy = "must be finite", "return fewer times when the clock stops"
-    demand(np.isfinite(times).all(), where, rule, "nan or inf", remedy)
-    gaps = np.diff(times, prepend=0.0)
-    k = int(np.argmin(gaps)) if len(gaps) else 0
-    demand(
-        not len(gaps) or gaps[k] > 0.0,
-        where,
-        "times must be above 0 and increase",
-        f"tick {k} at {times[k] if len(times) else 0.0:g} s, {gaps[k] if len(gaps) else 0.0:g} s "
-        "after the one before",
-    )
+    watched.demand("ticks", np.isfinite(times).all(), rule, "nan or inf", remedy)
+    for k in np.flatnonzero(np.diff(times, prepend=0.0) <= 0.0)[:1].tolist():
+        gap = times[k] - (times[k - 1] if k else 0.0)
+        got = f"tick {k} at {times[k]:g} s, {gap:g} s after the one before"
+        watched.demand("ticks", False, "times must be above 0 and increase", got)
 
 
 def _check_laws(watched: WatchedPart, entities: tuple[Entity, ...], seed: int) -> None:
     part, runs = watched.part, max(2, CHAINS // len(entities))
     rates = np.array([watched.call("mean_rate", entity) for entity in entities])
-    wrong, where = rates[rates <= 0.0], f"{watched.name}.mean_rate"
-    demand(not wrong.size, where, "must be above 0, or nan", wrong[:1].tolist())
+    wrong, unknown = rates[rates <= 0.0], np.isnan(rates)
+    watched.demand("mean_rate", not wrong.size, "must be above 0, or nan", wrong[:1].tolist())
     with guard_user_code(f"{watched.name}.ticks"):
-        horizon = LENGTH / float(np.nanmedian(rates)) if not np.isnan(rates).all() else 0.0
-        if not horizon:
+        if unknown.all():
             horizon = float(_read_ticks(watched, entities[0], (LENGTH,))[-1])
+        else:
+            horizon = LENGTH / float(np.nanmedian(rates))
 
         def draw(run: int, k: int, entity: Entity) -> FloatArray:
             streams = Streams(seed, run)
-            phase = lambda: streams.generator("phase", k)  # noqa: E731
-            return generate_ticks(part, entity, phase, streams.generator("testing", k), horizon)
+            phase, random = partial(streams.generator, "phase", k), streams.generator("testing", k)
+            return generate_ticks(part, entity, phase, random, horizon)
 
         times = [[draw(run, *item) for item in enumerate(entities)] for run in range(runs)]
     # Clocks without a stated rate are compared with the median of all.
     found = np.median(np.mean([[len(ticks) for ticks in one] for one in times], axis=0)) / horizon
-    law = stated_law(part, "activation")
-    labels = tuple(str(list(entity)) for entity in entities)
-    group = ClockGroup(
-        entities, np.where(np.isnan(rates), found, rates), (law,) * len(entities), labels
-    )
-    counts = _stack([_count(group, one, horizon) for one in times])
+    law, labels = stated_law(part, "activation"), tuple(str(list(entity)) for entity in entities)
+    rates = np.where(unknown, found, rates)
+    group = ClockGroup(entities, rates, (law,) * len(entities), labels)
+    counts = _count(group, times, horizon)
     if part.memoryless:
         _check_generators_used(watched, entities, times)
-    _check_rates(watched, group, counts, np.isnan(rates), horizon)
+    _check_rates(watched, group, counts, unknown, horizon)
     _check_gaps(watched, group, counts, times, horizon)
     if law is EXPONENTIAL:
         where, rule = f"{watched.name}.ticks", "ticks of links must be independent"
-        demand_agreement(
-            compare_clocks(group, counts.ticks, horizon, family_level()), where, rule, REMEDY
-        )
-        demand_agreement(_compare_gaps_of_links(group, times), where, rule, REMEDY)
+        apart = compare_clocks(group, counts.ticks, horizon, family_level())
+        for comparison in (apart, _compare_gaps_of_links(group, times)):
+            demand_agreement(comparison, where, rule, "use the generator given")
 
 
-def _count(group: ClockGroup, times: list[FloatArray], horizon: float) -> TickCounts:
-    owners = np.repeat(np.arange(len(times)), [len(ticks) for ticks in times])
-    return count_ticks(group, np.concatenate(times), owners, horizon)
-
-
-def _stack(counts: list[TickCounts]) -> TickCounts:
-    return TickCounts(*(np.array(column) for column in zip(*counts, strict=True)))
+def _count(group: ClockGroup, times: list[list[FloatArray]], horizon: float) -> TickCounts:
+    """Return counts of the ``times`` of all clocks in each of R runs."""
+    clocks, counts = np.arange(len(group.entities)), []
+    for one in times:
+        owners = np.repeat(clocks, [len(ticks) for ticks in one])
+        counts.append(count_ticks(group, np.concatenate(one), owners, horizon))
+    return stack_runs(counts)
 
 
 def _check_generators_used(
     watched: WatchedPart, entities: tuple[Entity, ...], times: list[list[FloatArray]]
 ) -> None:
-    where, rule = f"{watched.name}.ticks", "must draw from the generator given"
     first, *others = times[0]
-    count = min(len(first), len(times[1][0]))
-    is_same = np.array_equal(first[:count], times[1][0][:count])
-    demand(not is_same, where, rule, "equal times from two generators")
-    for entity, ticks in zip(entities[1:], others, strict=True):
+    others_of = {
+        f"{list(entity)}": ticks for entity, ticks in zip(entities[1:], others, strict=True)
+    }
+    for name, ticks in {"another run": times[1][0], **others_of}.items():
         count = min(len(first), len(ticks), GAPS)
+        # Of other rates, in units of their first gaps.
         is_same = np.array_equal(first[:count] / first[0], ticks[:count] / ticks[0])
-        text = f"equal times of {list(entities[0])} and {list(entity)} from two generators"
-        demand(not is_same, where, rule, text)
+        got = f"equal times of {list(entities[0])} and {name} from two generators"
+        watched.demand("ticks", not is_same, OTHER_GENERATOR, got)
 
 
 def _check_rates(
     watched: WatchedPart, group: ClockGroup, counts: TickCounts, unknown: np.ndarray, horizon: float
 ) -> None:
-    where, rule = f"{watched.name}.mean_rate", "must be the mean ticks per second in the long run"
-    ticks, distances = counts.ticks.sum(axis=1), []
+    ticks, distances, level = counts.ticks.sum(axis=1), [], 0.5 * family_level()
     slack = slack_of_start(group, ticks)
     if not unknown.any():
-        total = float(slack.sum())
-        distances = rates_of_all(group, counts.ticks, total, horizon, 0.5 * family_level())
+        distances = rates_of_all(group, counts.ticks, float(slack.sum()), horizon, level)
     if not unknown.any() or len(unknown) > 1:
-        singles = rates_of_each(group, ticks, slack, horizon, 0.5 * family_level())
+        singles = rates_of_each(group, ticks, slack, horizon, level)
         distances += list(zip(singles, group.labels, strict=True))
-    text = "ticks over the stated number"
+    rule = "must be the mean ticks per second in the long run"
     remedy = "define mean_rate if links differ by design" if unknown.any() else ""
-    demand_agreement(Comparison(distances, text), where, rule, remedy)
+    comparison = Comparison(distances, "ticks over the stated number")
+    demand_agreement(comparison, f"{watched.name}.mean_rate", rule, remedy)
 
 
 def _check_gaps(
@@ -285,18 +265,17 @@ def _check_gaps(
     horizon: float,
 ) -> None:
     law, part, where = group.gaps[0], watched.part, f"{watched.name}.ticks"
-    stated = stated_part(part, "activation")
-    derives = type(stated) is not type(part)
-    parent = f"{type(stated).__name__}, from which it derives" if derives else "its `gaps`"
+    parent = stating_class(part, "activation", "gaps")
     rule, remedy = f"gaps must have the law of {parent}", STATE_IT
     if part.memoryless:
         where, remedy = f"{watched.name}.memoryless", "return False: theory relies on it"
         rule = "must be False where ticks are no Poisson process"
     if isinstance(law, Lattice):
-        off, rule = float(counts.off.max()), f"must have the law of {parent}"
+        off, at_times = float(counts.off.max()), f"must tick at the times of {parent}"
         beside = f"{off:.3g} s beside one of them"
-        demand(off <= 1e-9 * horizon, where, f"must tick at the times of {parent}", beside, remedy)
-        first = _stack([_count(group, [ticks[:1] for ticks in one], horizon) for one in times])
+        watched.demand("ticks", off <= 1e-9 * horizon, at_times, beside, remedy)
+        rule = f"must have the law of {parent}"
+        first = _count(group, [[ticks[:1] for ticks in one] for one in times], horizon)
         demand_agreement(compare_gaps(first, family_level())[0], where, rule, remedy)
     shares, correlation = compare_gaps(counts, family_level())
     demand_agreement(shares, where, rule, remedy)

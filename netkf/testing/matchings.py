@@ -15,6 +15,7 @@ from netkf.network.matchings import Broadcast, Matching, RecordedSlots, SlotActi
 from netkf.rng.streams import Streams
 from netkf.testing.noise import demand_agreement, family_level
 from netkf.testing.watching import (
+    OTHER_GENERATOR,
     WatchedPart,
     demand,
     demand_array,
@@ -75,11 +76,9 @@ def _check_matching(part: Any, topology: Topology | None, seed: int) -> None:
     rule = "must be derived from Matching, RecordedSlots or Broadcast"
     remedy = "derive it from netkf.parts.Matching and define draw and mean"
     demand(isinstance(part, Matching), watched.name, rule, remedy=remedy)
-    before = watched.attributes()
     for network in accepted:
-        with guard_user_code(f"{watched.name}.draw"):
+        with watched.guard("draw"):
             _check_network(watched, copy, network, seed)
-    watched.demand_unchanged(before)
 
 
 def _accepts_graph(part: Any, topology: Topology, name: str) -> bool:
@@ -99,18 +98,15 @@ def _check_network(watched: WatchedPart, copy: Any, topology: Topology, seed: in
     for text, drawer in (("at the second call", part), ("of a pickled object", copy)):
         generator = _make_generator(seed, 0)
         repeated = _draw_matchings(drawer, topology, where, generator, REPEATED_SLOTS)
-        differing = np.flatnonzero((repeated != is_paired[:REPEATED_SLOTS]).any(axis=1))
-        if differing.size:
-            rule = "must draw the same from equal generators"
-            got = f"other pairs in slot {differing[0]} {text}"
-            fail(where, rule, got, "use only the generator given")
+        for slot in np.flatnonzero((repeated != is_paired[:REPEATED_SLOTS]).any(axis=1))[:1]:
+            rule, got = "must draw the same from equal generators", f"other pairs in slot {slot}"
+            fail(where, rule, f"{got} {text}", "use only the generator given")
     mean = _stated_mean(watched, topology)
     _check_frequencies(watched, topology, is_paired, mean)
     if is_paired.any(axis=0).any() and (is_paired[0] != is_paired).any():
         others = _draw_matchings(part, topology, where, _make_generator(seed, 1), SLOTS // 10)
-        is_same = np.array_equal(others, is_paired[: len(others)])
-        rule = "must draw from the generator given"
-        demand(not is_same, where, rule, "the same pairs from two different generators")
+        is_same, got = np.array_equal(others, is_paired[: len(others)]), "equal pairs from two"
+        demand(not is_same, where, OTHER_GENERATOR, f"{got} generators")
 
 
 def _make_generator(seed: int, run: int) -> np.random.Generator:
@@ -181,12 +177,9 @@ def _check_frequencies(
         found = compare_matchings(mean, counts, links, family_level())
         demand_agreement(found._replace(text=f"{graph}, {found.text}"), where, rule)
     labels, lags = [f"link {list(link)}" for link in links], range(1, MAX_LAG + 1)
-    demand_agreement(
-        compare_coincidences(is_paired[None], lags, labels, family_level()),
-        where,
-        "matchings of slots must be independent",
-        "remember nothing, and draw from the generator given",
-    )
+    comparison = compare_coincidences(is_paired[None], lags, labels, family_level())
+    remedy = "remember nothing, and draw from the generator given"
+    demand_agreement(comparison, where, "matchings of slots must be independent", remedy)
 
 
 def _is_edge_transitive(topology: Topology) -> bool:

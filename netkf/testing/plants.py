@@ -33,7 +33,6 @@ from netkf.testing.noise import (
 from netkf.testing.watching import (
     ROUNDING,
     WatchedPart,
-    call_user_function,
     demand,
     demand_array,
     demand_close,
@@ -96,8 +95,7 @@ def _check_plant(part: Any, seed: int) -> None:
         return
     rule = "must be left out: plants are checked as they are between two changes"
     demand(not len(part.changes), f"{name}.schedule", rule, f"{len(part.changes)} changes")
-    before = watched.attributes()
-    with guard_user_code(name):
+    with watched.guard():
         if not part.linear:
             check_dynamics(part, name)
         if isinstance(part, NonlinearPlant):
@@ -108,7 +106,6 @@ def _check_plant(part: Any, seed: int) -> None:
             _check_slots(part, copy, name, seed)
         elif isinstance(part, Diffusion):
             _check_diffusion(part, copy, name, seed)
-    watched.demand_unchanged(before)
 
 
 def _check_maps(part: NonlinearPlant, copy: Any, name: str, seed: int) -> None:
@@ -169,14 +166,9 @@ def _demand_same(where: str, one: FloatArray, other: FloatArray, when: str) -> N
 
 
 def _check_moved(
-    part: Any,
-    where: str,
-    draw: Callable[[Any], FloatArray],
-    x: FloatArray,
-    transitions: Sequence[FloatArray],
-    law: str,
+    part: Any, where: str, draw: Callable[[Any], FloatArray], transitions: Any, law: str
 ) -> None:
-    """Check that a moved start moves the path ``x`` (K, n) by ``transitions`` (K, n, n) from it."""
+    """Check that a moved start moves the path (K, n) by ``transitions`` (K, n, n) from it."""
     mean = part.start_mean + 3.0 * (1.0 + np.sqrt(np.diag(part.start_cov)))
     try:
         plant = dataclasses.replace(part, mean=mean)
@@ -185,7 +177,7 @@ def _check_moved(
     expected = np.array(transitions) @ (plant.start_mean - part.start_mean)
     if not expected.any():
         return
-    moved = draw(plant)
+    x, moved = draw(part), draw(plant)
     error = np.abs(moved - x - expected)
     worst = int(error.max(axis=1).argmax())
     rule = f"a start that is moved must move the path by {law}, and the noise not at all"
@@ -195,44 +187,27 @@ def _check_moved(
 
 
 def _check_starts(
-    part: Any,
-    where: str,
-    seed: int,
-    start: Callable[[np.random.Generator], FloatArray],
-    is_inherited: bool,
+    part: Any, where: str, seed: int, start: Callable[..., FloatArray], is_inherited: bool
 ) -> None:
     count = STARTS if part.start_cov.any() else FEW_STARTS
     with guard_user_code(where):
-        random = _make_generator(seed, 0)
-        starts = np.array([start(random) for _ in range(min(count, FEW_STARTS))])
-        more = np.empty((0, *starts.shape[1:]))
+        random, is_same = _make_generator(seed, 0), False
+        starts = np.array([start(random) for _ in range(FEW_STARTS)])
         if is_inherited and type(part).starts is Plant.starts:
             # Drawing them one by one would take most of the time of a check.
-            together = part.starts(_SharedNormals(_make_generator(seed, 0), count))
-            same = together[: len(starts)]
-            if starts.shape == same.shape and scaled_difference(starts, same) <= ROUNDING:
-                more = together[len(starts) :]
-        rest = count - len(starts) - len(more)
-        starts = np.array([*starts, *more, *(start(random) for _ in range(rest))])
+            together = part.starts(GeneratorNormals([_make_generator(seed, 0)] * count))
+            first = together[:FEW_STARTS]
+            is_same = starts.shape == first.shape and scaled_difference(starts, first) <= ROUNDING
+        rest = range(count - FEW_STARTS)
+        more = together[FEW_STARTS:] if is_same else [start(random) for _ in rest]
+        starts = np.array([*starts, *more])
     demand_array(where, "x(0)", starts[0], (part.n,))
-    deviations = starts - part.start_mean
     size = 1.0 + float(np.abs(part.start_mean).max())
     rule = "x(0) must be its mean in the directions in which cov has no variance"
     remedy = "start at mean + root of cov times normals"
-    unit = whitened(deviations, part.start_cov, size, where, rule, remedy)
+    unit = whitened(starts - part.start_mean, part.start_cov, size, where, rule, remedy)
     if unit.size:
         check_white(unit[:, None], NoiseLabels(where, "x(0) less its mean", "cov"))
-
-
-class _SharedNormals:
-    """Standard normal numbers for ``count`` runs, drawn from one generator run after run."""
-
-    def __init__(self, random: np.random.Generator, count: int) -> None:
-        self._random, self._count = random, count
-
-    def draw(self, shape: tuple[int, ...]) -> FloatArray:
-        """Return the next numbers (count, *shape) of all runs."""
-        return self._random.standard_normal((self._count, *shape))
 
 
 def _check_noise(
@@ -282,7 +257,7 @@ def _check_paths(
     transitions, laws = [np.eye(part.n)], steps.laws
     for k in range(len(at) - 1):
         transitions.append(laws[k % len(laws)][0] @ transitions[-1])
-    _check_moved(part, where, lambda plant: draw(plant, at), path, transitions, steps.power)
+    _check_moved(part, where, lambda plant: draw(plant, at), transitions, steps.power)
     states = np.array([draw(part, at, run) for run in range(runs)])
     for k, (Phi, S, noise) in enumerate(laws):
         after = states[:, k + 1 :: len(laws)]
@@ -319,23 +294,19 @@ def _check_slots(part: LinearPlant, copy: LinearPlant, name: str, seed: int) -> 
 
 
 def _compare_frames(part: LinearPlant, where: str, path: FloatArray, truth: Any) -> None:
-    frame = truth.frame_slots
-    origin = np.zeros(part.n)
+    frame, origin = truth.frame_slots, np.zeros(part.n)
     for slot, x in enumerate(path):
         origin = part.F @ origin if slot else origin
-        for kind, state in (
-            ("absolute", truth.absolute(slot)),
-            ("local", truth.local(slot) + origin),
-        ):
+        states = {"absolute": truth.absolute(slot), "local": truth.local(slot) + origin}
+        for kind, state in states.items():
             error = scaled_difference(np.asarray(state), x)
             rule = f"{kind} states must be the same in frames, up to the origin"
             text = f"{error:.3g} of the state apart in slot {slot}"
             demand(error <= FRAME_TOLERANCE, where, rule, text)
         if frame and slot and slot % frame == 0:
             origin = origin + truth.rebase(slot)
-            is_zero = not np.any(truth.local(slot))
             rule = "the local state must be 0 where a frame begins"
-            demand(is_zero, where, rule, truth.local(slot))
+            demand(not np.any(truth.local(slot)), where, rule, truth.local(slot))
 
 
 def _check_diffusion(part: Diffusion, copy: Diffusion, name: str, seed: int) -> None:
@@ -360,9 +331,9 @@ def _check_sampled(
     horizon = float(times[-1]) * 1.01
 
     def draw(plant: Any, at: FloatArray, run: int = 0) -> FloatArray:
-        random = _make_generator(seed, run)
-        truth = call_user_function(where, plant.sampled_truth, random, at[1:], horizon)
-        states = np.asarray(call_user_function(where, truth.states, at)[1])
+        with guard_user_code(where):
+            truth = plant.sampled_truth(_make_generator(seed, run), at[1:], horizon)
+            states = np.asarray(truth.states(at)[1])
         return demand_array(where, "states", states, (len(at), part.n))
 
     laws = []
@@ -382,16 +353,14 @@ def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:
     probe_times = period * np.array([1.3, 4.0, 5.5, 5.7])
     sample_times = period * np.array([2.5, 5.6])
 
-    def draw_paths(runs: Sequence[int], cut: bool = False) -> Any:
+    def draw_paths(runs: Sequence[int], cut: bool = False, plant: Any = part) -> Any:
         plant_normals, probe_normals, sample_normals = (
             GeneratorNormals([_make_generator(seed, run, purpose) for run in runs])
             for purpose in ("plant", "probe", "samples")
         )
-        no_times = np.empty(0)
-        cuts = (no_times, sample_normals, no_times)
-        if cut:
-            cuts = (probe_times, sample_normals, sample_times)
-        paths = call_user_function(where, part.paths, plant_normals, probe_normals, *cuts)
+        probes, samples = (times if cut else times[:0] for times in (probe_times, sample_times))
+        with guard_user_code(where):
+            paths = plant.paths(plant_normals, probe_normals, probes, sample_normals, samples)
         return paths.following(blocks)
 
     together = draw_paths(range(3))
@@ -402,16 +371,10 @@ def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:
     when = "at the points of its grid when cut"
     _demand_same(where, alone.x_end[0], cut.x_end[0][is_last_piece], when)
     _check_one_path(part, f"{name}.path", cut, (probe_times, sample_times), seed)
-
-    def draw_alone(plant: Any) -> FloatArray:
-        normals = (GeneratorNormals([_make_generator(seed, 1, p)]) for p in ("plant", "probe"))
-        path = plant.paths(*normals, probe_times[:0]).following(blocks)
-        return np.asarray(path.x_end[0][:steps])
-
     powers = [scipy.linalg.expm(part.A * period * k) for k in range(1, steps + 1)]
-    _check_moved(part, where, draw_alone, alone.x_end[0][:steps], powers, "e^{A t}")
-    runs = max(2, GRID_STEPS // (BLOCK * blocks))
-    drawn = draw_paths(range(runs))
+    draw = lambda plant: np.asarray(draw_paths([1], plant=plant).x_end[0][:steps])  # noqa: E731
+    _check_moved(part, where, draw, powers, "e^{A t}")
+    drawn = draw_paths(range(max(2, GRID_STEPS // (BLOCK * blocks))))
     start, end = drawn.x_start[:, :steps], drawn.x_end[:, :steps]
     end_and_moments = np.concatenate([end, *(drawn.moments[:, :steps, m] for m in (0, 1))], axis=2)
     Phi, S = moment_law(part.A, part.B, period)
@@ -430,12 +393,10 @@ def _check_one_path(
     plant_random, probe_random, sample_random = (
         _make_generator(seed, 1, purpose) for purpose in ("plant", "probe", "samples")
     )
-    path = call_user_function(
-        where, part.path, plant_random, probe_random, times[0], sample_random, times[1]
-    )
     # Every probe and sample time is the end of a piece; of all other ends the first ones will do.
     all_times = np.unique(np.concatenate([cut.end[:20], *times]))
     with guard_user_code(where):
+        path = part.path(plant_random, probe_random, times[0], sample_random, times[1])
         x = np.array([path.local(time) for time in all_times.tolist()])
     pieces = np.searchsorted(cut.end, all_times)
     when = "from the one that `paths` draws for the same run"

@@ -14,7 +14,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.rng.streams import Streams
-from netkf.testing.watching import call_user_function, demand, demand_array, guard_user_code
+from netkf.testing.watching import demand, demand_array, guard_user_code
 
 PERIOD, HORIZON = 1.0, 1e6  # seconds of a slot, and of a run: readings end before
 STEP = 0.1  # seconds of a step of increments
@@ -30,54 +30,40 @@ class ReadingSeries(NamedTuple):
 
 
 class SensorReader:
-    """Reads a sensor in slots. ``name`` is that of the user's class.
+    """Reads a sensor in slots, or the ``samples`` that it takes of a diffusion. ``name`` is that of
+    the user's class.
 
-    A path, which the ``method`` of the sensor returns, gives the readings of one node in one run.
-    ``p`` is the number of rows of a reading, ``n`` that of states.
+    A path, which a method of the sensor returns, gives the readings of one node in one run. ``p``
+    is the number of rows of a reading, ``n`` that of states.
     """
 
-    method = "slot_path"
-
-    def __init__(self, sensor: Any, name: str) -> None:
+    def __init__(self, sensor: Any, name: str, method: str = "slot_path") -> None:
         """Take the ``sensor``, with a matrix H (p, n), and the name of its class."""
-        self.sensor, self.where = sensor, f"{name}.{self.method}"
+        self.sensor, self.where, self.samples = sensor, f"{name}.{method}", method == "samples"
         self.p, self.n = len(sensor.R), sensor.H.shape[1]
 
     def make_path(self, streams: Streams, node: int) -> Any:
         """Return the path of a node in one run, made with the run's random ``streams``."""
-        return call_user_function(self.where, self._make_path, node, generators(streams, node))
-
-    def _make_path(self, node: int, generator: Callable[[str], np.random.Generator]) -> Any:
-        return self.sensor.slot_path(node, PERIOD, generator)
+        generator = generators(streams, node)
+        with guard_user_code(self.where):
+            if self.samples:
+                return self.sensor.samples(node, generator, HORIZON)
+            return self.sensor.slot_path(node, PERIOD, generator)
 
     def read_several(self, path: Any, ks: Sequence[int], x: FloatArray) -> ReadingSeries:
         """Return y (K, p) and H (K, p, n) of readings ``ks`` at ``x`` (K, n), in one call."""
-        y, H = call_user_function(self.where, path.several, ks, x)
+        with guard_user_code(self.where):
+            y, H = path.several(ks, x)
         y = demand_array(self.where, "y of several", y, (len(ks), self.p))
         return ReadingSeries(y, demand_array(self.where, "H of several", H, (*y.shape, self.n)))
 
     def read_one(self, path: Any, k: int, x: FloatArray) -> ReadingSeries:
         """Return reading number ``k`` at the state ``x`` (n,) as a series of one reading."""
         with guard_user_code(self.where):
-            y, H = self._read_one(path, k, x)
+            # In the order in which engines call them.
+            y, H = path.reading(k, x) if self.samples else (path.reading(k, x), path.matrix(k))
         y = demand_array(self.where, "a reading", y, (self.p,))
         return ReadingSeries(y[None], demand_array(self.where, "H", H, (self.p, self.n))[None])
-
-    def _read_one(self, path: Any, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return path.reading(k, x), path.matrix(k)  # in the order in which engines call them
-
-
-class SampleReader(SensorReader):
-    """Reads the samples of a sensor over a diffusion."""
-
-    method = "samples"
-
-    def _make_path(self, node: int, generator: Callable[[str], np.random.Generator]) -> Any:
-        return self.sensor.samples(node, generator, HORIZON)
-
-    def _read_one(self, path: Any, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        y, H = path.reading(k, x)
-        return y, H
 
 
 def generators(streams: Streams, node: int) -> Callable[[str], np.random.Generator]:
@@ -85,18 +71,12 @@ def generators(streams: Streams, node: int) -> Callable[[str], np.random.Generat
     return lambda purpose: streams.generator(purpose, node, 0)
 
 
-def make_readers(sensor: Sensor, name: str) -> list[SensorReader]:
-    """Return the reader of samples, or else of readings in slots, in a list."""
+def make_reader(sensor: Sensor, name: str) -> SensorReader:
+    """Return the reader of samples, or else of readings in slots."""
     has_clock = getattr(sensor, "sampling", None) is not None
     overrides_samples = type(sensor).samples not in (Sensor.samples, LinearSensor.samples)
-    if has_clock or (overrides_samples and not sensor.varying):
-        return [SampleReader(sensor, name)]
-    return [SensorReader(sensor, name)]
-
-
-def gives_increments(sensor: Sensor) -> bool:
-    """Return True for a sensor that is read continuously: a linear one without a sampling clock."""
-    return isinstance(sensor, LinearSensor) and sensor.sampling is None
+    samples = has_clock or (overrides_samples and not sensor.varying)
+    return SensorReader(sensor, name, "samples" if samples else "slot_path")
 
 
 class IncrementPieces(NamedTuple):
@@ -111,11 +91,22 @@ class IncrementPieces(NamedTuple):
     spans: FloatArray
     step: np.ndarray
 
+    @property
+    def gaps(self) -> FloatArray:
+        """Lengths (K, 1) of the pieces in seconds."""
+        return self.spans[:, 1:] - self.spans[:, :1]
+
+    def noise(self, H: FloatArray, x: FloatArray) -> FloatArray:
+        """Return the moments (K, 2, p) without those of ``H x``."""
+        drift = self.gaps * (H @ x)
+        return self.moments - np.stack([drift, np.zeros_like(drift)], axis=1)
+
 
 class IncrementReader(SensorReader):
     """Reads the increments of a sensor of a constant state, over steps that may be cut."""
 
-    method = "path"
+    def __init__(self, sensor: Any, name: str) -> None:
+        super().__init__(sensor, name, "path")
 
     def read_pieces(
         self, streams: Streams, node: int, x: FloatArray, steps: int, cut: bool

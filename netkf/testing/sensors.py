@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,9 +14,10 @@ from netkf.laws.ticks import count_interval
 from netkf.linalg.arrays import FloatArray
 from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.regressors import RegressorSensor
-from netkf.plants.sensors import Sensor
+from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.rng.streams import Streams
 from netkf.scenario.plugins import describe_failure
+from netkf.testing.dynamics import check_derivatives
 from netkf.testing.noise import (
     NoiseLabels,
     check_independent,
@@ -32,15 +33,14 @@ from netkf.testing.readings import (
     SensorReader,
     demand_matrices,
     generators,
-    gives_increments,
-    make_readers,
+    make_reader,
 )
 from netkf.testing.watching import (
     ROUNDING,
     WatchedPart,
-    call_user_function,
     demand,
     demand_close,
+    demand_vector,
     fail,
     guard_user_code,
     make_part,
@@ -56,8 +56,6 @@ SHORT_LENGTH = 40
 """Readings that are compared exactly."""
 TIMES_RUNS, EXPECTED_SAMPLES = 400, 50.0
 """Runs in which samples are counted, and the mean number of them in a run."""
-DERIVATIVE_STEP, DERIVATIVE_TOLERANCE = 1e-5, 1e-6
-"""Step of the state in differences of h, and their tolerated error over 1 + the largest entry."""
 MAX_STATES = 12
 """Largest number of components of a state with which a nonlinear sensor is tried."""
 
@@ -93,27 +91,25 @@ def check_sensor(sensor: Any, /, **settings: Any) -> None:
 
 def _check_sensor(part: Any, seed: int) -> None:
     watched = WatchedPart(part)
-    copy = watched.pickle_copy()
+    copy, name = watched.pickle_copy(), watched.name
     if isinstance(part, NonlinearSensor):
-        _check_nonlinear(part, watched.name, seed)
+        _check_nonlinear(part, name)
         return
     if not part.is_random:
         return
-    demand_matrices(part, watched.name)
-    before = watched.attributes()
-    nodes = part.nodes[:MAX_NODES]
-    with guard_user_code(watched.name):
-        for reader in make_readers(part, watched.name):
-            _check_same_readings(reader, type(reader)(copy, watched.name), nodes, seed)
-            _check_linear(reader, nodes[0], seed)
-            _check_laws(reader, nodes, seed)
-        if gives_increments(part):
-            _check_increments(IncrementReader(part, watched.name), nodes[0], seed)
+    demand_matrices(part, name)
+    nodes, sampling = part.nodes[:MAX_NODES], getattr(part, "sampling", None)
+    with watched.guard():
+        reader = make_reader(part, name)
+        _check_same_readings(reader, make_reader(copy, name), nodes, seed)
+        _check_linear(reader, nodes[0], seed)
+        _check_laws(reader, nodes, seed)
+        if isinstance(part, LinearSensor) and sampling is None:  # it is read continuously
+            _check_increments(IncrementReader(part, name), nodes[0], seed)
         if isinstance(part, RegressorSensor):
-            _check_regressors(part, SensorReader(part, watched.name), nodes, seed)
-        if getattr(part, "sampling", None) is not None:
-            _check_times(part, watched.name, nodes, seed)
-    watched.demand_unchanged(before)
+            _check_regressors(part, SensorReader(part, name), nodes, seed)
+        if sampling is not None:
+            _check_times(part, f"{name}.sample_times", nodes, seed)
 
 
 def _make_states(seed: int, count: int, n: int, run: int = 0) -> FloatArray:
@@ -124,40 +120,34 @@ def _make_states(seed: int, count: int, n: int, run: int = 0) -> FloatArray:
 def _check_same_readings(
     reader: SensorReader, copy: SensorReader, nodes: tuple[int, ...], seed: int
 ) -> None:
-    node, streams, x = nodes[0], Streams(seed), _make_states(seed, SHORT_LENGTH, reader.n)
-    numbers, with_gaps = list(range(SHORT_LENGTH)), [0, 1, 5, 6, 20, 39]
-    series = reader.read_several(reader.make_path(streams, node), numbers, x)
-    others = [reader.make_path(Streams(seed, 1 + k), other) for k, other in enumerate(nodes)]
-
-    def read_others(k: int) -> None:
-        for path in others:
-            reader.read_one(path, k, x[k])
-
-    def demand_same(
-        when: str, of: SensorReader, groups: Sequence[list[int]], between: Any = None
-    ) -> None:
-        path, readings = of.make_path(streams, node), []
-        for ks in groups:
-            if between is not None:
-                between(ks[0])
-            one_by_one = len(ks) == 1
-            read = of.read_one(path, ks[0], x[ks[0]]) if one_by_one else None
-            readings.append(read or of.read_several(path, ks, x[ks]))
-        chosen = [k for ks in groups for k in ks]
-        remedy = "use only the generators given, and draw for each reading in order"
-        for name, one, parts in zip(
-            ("readings", "matrices H"), series, zip(*readings, strict=True), strict=True
-        ):
-            rule = f"{name} must be the same for equal streams"
-            demand_close(one[chosen], np.concatenate(parts), reader.where, rule, when, remedy)
-
+    streams, x = Streams(seed), _make_states(seed, SHORT_LENGTH, reader.n)
+    numbers = list(range(SHORT_LENGTH))
+    series = reader.read_several(reader.make_path(streams, nodes[0]), numbers, x)
     # Paths of other nodes are made and read in between, as in a simulation.
-    when = "when other sensors are read between its readings, one by one"
-    demand_same(when, reader, [[k] for k in numbers], read_others)
-    demand_same("when readings are left out", reader, [[k] for k in with_gaps])
-    groups = [[0, 3], [4, 5, 6, 17], [39]]
-    demand_same("when they are asked for in other groups", reader, groups)
-    demand_same("of a pickled sensor", copy, [numbers])
+    others = [reader.make_path(Streams(seed, 1 + k), other) for k, other in enumerate(nodes)]
+    remedy = "use only the generators given, and draw for each reading in order"
+    for when, of, groups, between in (
+        (
+            "when other sensors are read between its readings, one by one",
+            reader,
+            [[k] for k in numbers],
+            others,
+        ),
+        ("when readings are left out", reader, [[0], [1], [5], [6], [20], [39]], ()),
+        ("when they are asked for in other groups", reader, [[0, 3], [4, 5, 6, 17], [39]], ()),
+        ("of a pickled sensor", copy, [numbers], ()),
+    ):
+        path, readings = of.make_path(streams, nodes[0]), []
+        for ks in groups:
+            for other in between:
+                reader.read_one(other, ks[0], x[ks[0]])
+            one = of.read_one(path, ks[0], x[ks[0]]) if len(ks) == 1 else None
+            readings.append(one or of.read_several(path, ks, x[ks]))
+        chosen = [k for ks in groups for k in ks]
+        names = "readings", "matrices H"
+        for name, first, parts in zip(names, series, zip(*readings, strict=True), strict=True):
+            rule = f"{name} must be the same for equal streams"
+            demand_close(first[chosen], np.concatenate(parts), reader.where, rule, when, remedy)
 
 
 def _check_linear(reader: SensorReader, node: int, seed: int) -> None:
@@ -204,33 +194,24 @@ def _check_laws(reader: SensorReader, nodes: tuple[int, ...], seed: int) -> None
 def _check_increments(reader: IncrementReader, node: int, seed: int) -> None:
     x, other_x = _make_states(seed, 2, reader.n)
     streams = Streams(seed)
-    cut = reader.read_pieces(streams, node, x, SHORT_LENGTH, cut=True)
-    uncut = reader.read_pieces(streams, node, x, SHORT_LENGTH, cut=False)
+    read = partial(reader.read_pieces, streams, node)
+    cut, uncut = (read(x, SHORT_LENGTH, cut=is_cut) for is_cut in (True, False))
     rule = "increments of the pieces of a step must add up to those of the step"
     remedy = "draw the noise of the grid first, and cut it by its conditional law"
     demand_close(reader.combine(cut), uncut.moments, reader.where, rule, remedy=remedy)
-    repeated = reader.read_pieces(streams, node, x, SHORT_LENGTH, cut=True)
+    repeated = read(x, SHORT_LENGTH, cut=True)
     rule, remedy = "increments must be the same for equal streams", "use only the generators given"
     demand_close(cut.moments, repeated.moments, reader.where, rule, remedy=remedy)
-    other = reader.read_pieces(streams, node, other_x, SHORT_LENGTH, cut=True)
-    gaps = (other.spans[:, 1] - other.spans[:, 0])[:, None]
-    change = gaps * (reader.sensor.H @ (other_x - x))
-    expected = cut.moments + np.stack([change, np.zeros_like(change)], axis=1)
+    other = read(other_x, SHORT_LENGTH, cut=True)
     rule = "another state must change increments by H times its integral, and the noise not at all"
-    demand_close(other.moments, expected, reader.where, rule)
-    _check_increment_noise(reader, node, x, seed)
-
-
-def _check_increment_noise(reader: IncrementReader, node: int, x: FloatArray, seed: int) -> None:
-    factor = whiten(reader.sensor.R).factor
-    noises = []
+    H = reader.sensor.H
+    demand_close(other.noise(H, other_x), cut.noise(H, x), reader.where, rule)
+    factor, noises = whiten(reader.sensor.R).factor, []
     for run in range(RUNS):
         pieces = reader.read_pieces(Streams(seed, run), node, x, STEPS, cut=True)
-        gaps = (pieces.spans[:, 1] - pieces.spans[:, 0])[:, None]
-        drift = gaps * (reader.sensor.H @ x)
-        noise = pieces.moments - np.stack([drift, np.zeros_like(drift)], axis=1)
         # The moments of unit noise over g seconds have the variances g and g / 3.
-        deviations = np.sqrt(gaps[:, :, None] * np.array([[1.0], [1.0 / 3.0]]))
+        deviations = np.sqrt(pieces.gaps[:, :, None] * np.array([[1.0], [1.0 / 3.0]]))
+        noise = pieces.noise(H, x)
         noises.append((noise / deviations @ factor.T).reshape(len(noise), -1))
     text = f"the noise of increments (their two moments, over steps of {STEP:g} s)"
     check_white(np.array(noises), NoiseLabels(reader.where, text, "R"))
@@ -281,23 +262,28 @@ def _check_regressor_steps(sensor: RegressorSensor, H: FloatArray, labels: Noise
     check_white(unit, labels._replace(noise="the steps of H"))
 
 
-def _check_times(sensor: Any, name: str, nodes: tuple[int, ...], seed: int) -> None:
-    where, horizon = f"{name}.sample_times", 30.0
+def _check_times(sensor: Any, where: str, nodes: tuple[int, ...], seed: int) -> None:
     rate = sensor.sampling.mean_rate((nodes[0], 0)) if isinstance(sensor.sampling, Clock) else 1.0
-    if rate > 0.0:
-        horizon = 50.0 / rate
-    _check_sampling_rate(sensor, where, nodes, seed)
+    horizon = EXPECTED_SAMPLES / rate if rate > 0.0 else 30.0
+    if sensor.sampling.mean_rate((nodes[0], 0)) > 0.0:
+        runs = 1 + TIMES_RUNS // len(nodes)
+        counts = [
+            len(_read_times(sensor, where, node, seed + 1 + run, horizon))
+            for node in nodes
+            for run in range(runs)
+        ]
+        # The phase of a clock may add or remove one tick in each run.
+        level, values = family_level(), np.array(counts)
+        distance = count_interval(values, EXPECTED_SAMPLES, level, False, 1.0)
+        comparison = Comparison([(distance, "all nodes")], "samples over the stated number")
+        demand_agreement(comparison, where, "must be as many as the mean rate of `sampling` states")
     for node in nodes:
         ends = (horizon, 0.4 * horizon, horizon)
         first, shorter, repeated = (_read_times(sensor, where, node, seed, end) for end in ends)
         for times, end in zip((first, shorter), ends, strict=False):
             is_inside = not len(times) or (times[0] > 0.0 and times[-1] < end)
-            demand(
-                is_inside,
-                where,
-                f"must lie in (0, {end:g}), the run",
-                times[:: max(len(times) - 1, 1)],
-            )
+            rule = f"must lie in (0, {end:g}), the run"
+            demand(is_inside, where, rule, times[:: max(len(times) - 1, 1)])
             demand((np.diff(times) > 0.0).all(), where, "must increase")
         rule, remedy = "must be the same for equal streams", "use the generators given"
         demand(np.array_equal(first, repeated), where, rule, remedy=remedy)
@@ -306,57 +292,24 @@ def _check_times(sensor: Any, name: str, nodes: tuple[int, ...], seed: int) -> N
         demand(is_same, where, rule, f"{len(shorter)} times before 0.4 T")
 
 
-def _check_sampling_rate(sensor: Any, where: str, nodes: tuple[int, ...], seed: int) -> None:
-    rate = sensor.sampling.mean_rate((nodes[0], 0))
-    if not rate > 0.0:
-        return
-    runs, horizon = 1 + TIMES_RUNS // len(nodes), EXPECTED_SAMPLES / rate
-    counts = [
-        len(_read_times(sensor, where, node, seed + 1 + run, horizon))
-        for node in nodes
-        for run in range(runs)
-    ]
-    # The phase of a clock may add or remove one tick in each run.
-    distance = count_interval(np.array(counts), EXPECTED_SAMPLES, family_level(), False, 1.0)
-    comparison = Comparison([(distance, "all nodes")], "samples over the stated number")
-    demand_agreement(comparison, where, "must be as many as the mean rate of `sampling` states")
-
-
 def _read_times(sensor: Any, where: str, node: int, seed: int, horizon: float) -> FloatArray:
-    generator = generators(Streams(seed), node)
-    times = np.asarray(call_user_function(where, sensor.sample_times, node, 0, generator, horizon))
-    is_vector = times.ndim == 1 and times.dtype == np.float64
-    demand(is_vector, where, "must be a vector of float64", f"{times.dtype} {times.shape}")
-    return times
+    with guard_user_code(where):
+        generator = generators(Streams(seed), node)
+        times = np.asarray(sensor.sample_times(node, 0, generator, horizon))
+    return demand_vector(where, times)
 
 
-def _check_nonlinear(sensor: NonlinearSensor, name: str, seed: int) -> None:
-    positions = {node: (0.7 * k, -0.4 * k) for k, node in enumerate(sensor.nodes)}
-    sensor = sensor.located(positions)
+def _check_nonlinear(sensor: NonlinearSensor, name: str) -> None:
+    sensor = sensor.located({node: (0.7 * k, -0.4 * k) for k, node in enumerate(sensor.nodes)})
     p, n = len(sensor.R), _find_state_size(sensor, name)
     for node in sensor.nodes[:MAX_NODES]:
-        for x in _make_states(seed, SHORT_LENGTH, n):
+        h, jacobian = (partial(of, node=node) for of in (sensor.h, sensor.jacobian))
+        for x in _make_states(0, SHORT_LENGTH, n):
             with guard_user_code(name):
-                value = np.asarray(sensor.h(x.copy(), node))
-                repeated = np.asarray(sensor.h(x.copy(), node))
-                J = np.asarray(sensor.jacobian(x.copy(), node))
-            demand(value.shape == (p,), f"{name}.h", f"must give {p} numbers, as R says", value)
-            is_same = np.array_equal(value, repeated)
-            remedy = "return what is read without noise, which netkf adds"
-            demand(is_same, f"{name}.h", "must be the same for a state", repeated, remedy)
-            demand(J.shape == (p, n), f"{name}.jacobian", f"must be {p} x {n}", str(J.shape))
-            numerical = np.empty_like(J)
-            for k, step in enumerate(np.eye(n) * DERIVATIVE_STEP):
-                ahead, behind = (np.asarray(sensor.h(x + move, node)) for move in (step, -step))
-                numerical[:, k] = sensor.difference(ahead, behind) / (2.0 * DERIVATIVE_STEP)
-            error = float(np.abs(numerical - J).max())
-            demand(
-                error <= DERIVATIVE_TOLERANCE * (1.0 + float(np.abs(J).max())),
-                f"{name}.jacobian",
-                "must be the derivatives of h",
-                f"entries that are off by {error:.2g} at x = {np.round(x, 3).tolist()}",
-                "compare it with differences of h",
-            )
+                value = np.asarray(h(x.copy()))
+                rule = f"must give {p} numbers, as R says"
+                demand(value.shape == (p,), f"{name}.h", rule, value)
+                check_derivatives((name, "h", "x and node"), h, jacobian, x, sensor.difference)
 
 
 def _find_state_size(sensor: NonlinearSensor, name: str) -> int:

@@ -22,9 +22,12 @@ from netkf.core.errors import NetkfError, quote
 from netkf.core.fields import Component
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.plugins import describe_error, describe_failure
+from netkf.testing.generators import RecordingGenerator
 
 Leaves = dict[str, Any]
 """Copies of the numbers, texts and arrays in a value, by their paths such as ``.P[0]``."""
+OWN_GENERATOR = "must use no generator but the one it is given"
+OTHER_GENERATOR = "must draw from the generator given"
 ROUNDING = 1e-9
 """Difference (:func:`scaled_difference`) up to which arrays count as equal."""
 MERSENNE_BYTES = 4 * 625
@@ -45,6 +48,11 @@ def demand(holds: object, where: str, rule: str, got: object = None, remedy: str
     """Raise AssertionError with the line ``where: rule; got ...; remedy`` unless ``holds``."""
     if not holds:
         fail(where, rule, got, remedy)
+
+
+def is_number(value: Any) -> bool:
+    """Return True for a number of Python or numpy, not for an array or text."""
+    return isinstance(value, (int, float, np.floating))
 
 
 def make_part(
@@ -251,9 +259,7 @@ class WatchedPart:
             remedy = "; set inverts in needs where covariances must not be singular"
             text = f"{where}: {describe_failure(error)}{remedy if singular else ''}"
             raise AssertionError(text) from error
-        rule = "must not use or seed global generators (numpy.random.*, random.*)"
-        remedy = "draw from the generator that is handed in"
-        demand(global_generator_states() == before, where, rule, remedy=remedy)
+        _forbid_global_generators(where, before)
         return result
 
     def _parameter_names(self, method: str, count: int) -> list[str]:
@@ -267,12 +273,31 @@ class WatchedPart:
             rule = f"returned something that a later call changed ({(path or '').lstrip('.')})"
             demand(path is None, where, rule, remedy="return copies, share no buffers")
 
-    def demand_unchanged(self, before: Leaves) -> None:
-        """Check that :meth:`attributes` are still those of ``before``."""
+    @contextmanager
+    def guard(self, method: str = "") -> Iterator[None]:
+        """Guard what calls the user's ``method``, or several, as :func:`guard_user_code`, and check
+        that the object is left as it is.
+        """
+        before = self.attributes()
+        with guard_user_code(f"{self.name}.{method}".rstrip(".")):
+            yield
         path = differing_path(before, self.attributes())
         rule = f"must not change its own object, but changed {path}"
         remedy = "keep what changes in the paths and states that its methods return"
         demand(path is None, self.name, rule, remedy=remedy)
+
+    def demand(
+        self, method: str, holds: object, rule: str, got: object = None, remedy: str = ""
+    ) -> None:
+        """Raise AssertionError ``Class.method: rule; got ...; remedy`` unless ``holds``."""
+        demand(holds, f"{self.name}.{method}", rule, got, remedy)
+
+    def repeat(self, method: str, draw: Callable[[RecordingGenerator], Any]) -> Any:
+        """Return what ``draw`` makes of a generator, which must be the same of an equal one."""
+        first, second = (draw(RecordingGenerator(5)) for _ in range(2))
+        path = differing_path(collect_leaves(first), collect_leaves(second))
+        self.demand(method, path is None, OWN_GENERATOR, "another result from an equal generator")
+        return first
 
     def pickle_copy(self) -> Any:
         """Return a copy of the user's object made by pickle; check that it is equal."""
@@ -308,15 +333,13 @@ def guard_user_code(where: str) -> Iterator[None]:
         raise
     except Exception as error:
         raise AssertionError(f"{where}: {describe_failure(error)}") from error
+    _forbid_global_generators(where, before)
+
+
+def _forbid_global_generators(where: str, before: tuple[Any, Any]) -> None:
     rule = "must not use or seed global generators (numpy.random.*, random.*)"
     remedy = "draw from the generator that is handed in"
     demand(global_generator_states() == before, where, rule, remedy=remedy)
-
-
-def call_user_function(where: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a user's ``function``; an exception becomes an AssertionError that names ``where``."""
-    with guard_user_code(where):
-        return function(*arguments)
 
 
 def demand_array(
@@ -327,6 +350,14 @@ def demand_array(
     demand(array.shape == shape, where, f"{name} must have the shape {shape}", str(array.shape))
     demand(array.dtype == np.float64, where, f"{name} must be float64", str(array.dtype))
     demand(np.isfinite(array).all(), where, f"{name} must be finite", array, remedy)
+    return array
+
+
+def demand_vector(where: str, value: Any) -> FloatArray:
+    """Return ``value`` as a vector of any length; AssertionError unless of float64."""
+    array = np.asarray(value)
+    is_vector = array.ndim == 1 and array.dtype == np.float64
+    demand(is_vector, where, "must be a vector of float64", f"{array.dtype} {array.shape}")
     return array
 
 
