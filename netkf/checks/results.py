@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.checks.parts.samples import PART_TYPES, PartSummary
+from netkf.checks.parts.samples import PART_TYPES
 from netkf.checks.records.rows import Audit, audit_columns, read_audit
 from netkf.checks.samples import ReplicaSummary
 from netkf.ensembles.replicas import Form
@@ -21,14 +21,14 @@ class ReplicaResult(NamedTuple):
                  filter class, on the same readings and messages, in standard deviations; nan if the
                  base was not run or rounding hides the difference
     expected   : a divergence is no surprise, because the built-in filter diverges too
-    parts      : statistics of the parts of the scenario
+    parts      : statistics of the parts of the scenario, by the names of PART_TYPES
     audit      : what is wrong with the record of the run
     """
 
     summary: ReplicaSummary | None
     difference: float
     expected: bool = False
-    parts: PartSummary | None = None
+    parts: Mapping[str, Any] | None = None
     audit: Audit = Audit()
 
     @property
@@ -52,9 +52,9 @@ def result_columns(results: Sequence[ReplicaResult]) -> dict[str, np.ndarray]:
         columns[f"summary.{name}"] = np.array(
             [getattr(result.summary, name) for result in completed]
         )
-    for part, first in zip(PartSummary._fields, completed[0].parts or (), strict=False):
-        for name in first._fields if first is not None else ():
-            values = [getattr(getattr(result.parts, part), name) for result in completed]
+    for part, first in (completed[0].parts or {}).items():
+        for name in first._fields:
+            values = [getattr((result.parts or {})[part], name) for result in completed]
             columns[f"{part}.{name}"] = np.array(values)
     return columns
 
@@ -72,13 +72,9 @@ def results_of_columns(columns: Mapping[str, Any]) -> list[ReplicaResult]:
             continue
         values_of_replica = {name: v[index] for name, v in columns.items() if "." in name}
         summary = ReplicaSummary(**_select_fields(values_of_replica, "summary"))
-        parts = {
-            part: cls(**_select_fields(values_of_replica, part))
-            if _select_fields(values_of_replica, part)
-            else None
-            for part, cls in PART_TYPES.items()
-        }
-        results.append(ReplicaResult(summary, difference, expected, PartSummary(**parts), audit))
+        fields = {part: _select_fields(values_of_replica, part) for part in PART_TYPES}
+        parts = {part: PART_TYPES[part](**values) for part, values in fields.items() if values}
+        results.append(ReplicaResult(summary, difference, expected, parts, audit))
         index += 1
     return results
 

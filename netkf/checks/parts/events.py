@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -107,21 +107,22 @@ def ticks_of(scenario: Scenario, run: Run) -> TickCounts | None:
     return count_ticks(group, times, owners, scenario.horizon)._replace(off=np.array(off))
 
 
-def samples_of(scenario: Scenario, streams: Streams) -> TickCounts | None:
-    """Return counts of samples of sensors, drawn again from ``streams``; None without clocks."""
+def samples_of(scenario: Scenario, run: Run) -> TickCounts | None:
+    """Return counts of samples of sensors, drawn again; None without clocks."""
     group = sampling_clocks(scenario)
     if not group.entities:
         return None
-    all_times = scenario.sample_times(streams)
-    times = [all_times[entity] for entity in group.entities]
+    times = draw_samples(scenario, group.entities, run.seed, run.replica)
     owners = np.repeat(np.arange(len(times)), [len(t) for t in times])
     return count_ticks(group, np.concatenate(times), owners, scenario.horizon)
 
 
-def count_drawn_ticks(scenario: Scenario, seed: int, replica: int) -> np.ndarray:
-    """Return how often each of E clocks ticks in a ``replica``, (E,), drawn again."""
-    ticks = draw_ticks(scenario, network_clocks(scenario).entities, seed, replica)
-    return np.array([len(times) for times in ticks])
+def draw_samples(
+    scenario: Scenario, entities: Sequence[Entity], seed: int, replica: int
+) -> list[FloatArray]:
+    """Return the times (s) of samples of each of the ``entities`` in a ``replica``, drawn again."""
+    times = scenario.sample_times(Streams(seed, replica))
+    return [times[entity] for entity in entities]
 
 
 def draw_ticks(
@@ -141,12 +142,6 @@ def draw_ticks(
         for entity in entities
     )
     return [scenario.time_grid.before(horizon, times) for times in ticks]
-
-
-def count_drawn_samples(scenario: Scenario, seed: int, replica: int) -> np.ndarray:
-    """Return how often each of E sensors samples in a ``replica``, (E,), drawn again."""
-    times = scenario.sample_times(Streams(seed, replica))
-    return np.array([len(times[entity]) for entity in sampling_clocks(scenario).entities])
 
 
 @lru_cache(maxsize=8)
@@ -190,34 +185,61 @@ def _redraws_links(scenario: Scenario) -> bool:
     return all(filter_.timing.redraws(*step) for step in steps)
 
 
-def losses_of(scenario: Scenario, run: Run) -> LossCounts | None:
+class Messages(NamedTuple):
+    """The K messages of a run, in order of direction and number: the rows in which they were
+    ``sent``, the ``direction`` (K,) of each, whether it is ``lost`` (K,), and its ``age`` (K,) at
+    arrival, inf without one.
+    """
+
+    sent: np.ndarray
+    direction: IntArray
+    lost: np.ndarray
+    age: FloatArray
+
+
+def messages_of(scenario: Scenario, run: Run) -> Messages:
+    """Return the messages of a run, each with what became of it."""
+    kinds = ("send",), ("lost",), ("deliver", "late")
+    sends, losses, arrivals = (rows_of(run.log, *names) for names in kinds)
+    width = int(sends["message"].max(initial=0)) + 1
+
+    def keys(rows: np.ndarray, sender: str, receiver: str) -> IntArray:
+        """Return one integer for each message: its direction, and its number in that."""
+        places = _places(scenario.topology.directions, [rows[sender], rows[receiver]])
+        return np.asarray(places * width + rows["message"], dtype=np.int64)
+
+    sent = keys(sends, "node", "peer")
+    order = np.argsort(sent, kind="stable")
+    sends, sent = sends[order], sent[order]
+    # The receiver of a message comes first in the row of its arrival.
+    arrived, age = keys(arrivals, "peer", "node"), np.full(len(sent), np.inf)
+    known = np.isin(arrived, sent)
+    age[np.searchsorted(sent, arrived[known])] = arrivals["age"][known]
+    return Messages(sends, sent // width, np.isin(sent, keys(losses, "node", "peer")), age)
+
+
+def losses_of(scenario: Scenario, messages: Messages) -> LossCounts | None:
     """Return counts of sent and lost messages by window and direction; None without links."""
-    directions, log = scenario.topology.directions, run.log
-    sends, losses = (rows_of(log, kind) for kind in ("send", "lost"))
-    if not directions:
+    size, horizon = len(scenario.topology.directions), scenario.horizon
+    if not size:
         return None
-    size, number = len(directions), losses["message"]
-    lost_at, sent_at = (
-        _places(directions, [rows["node"], rows["peer"]]) for rows in (losses, sends)
-    )
-    sent = count_by_window(sends["t"], sent_at, size, scenario.horizon)
-    lost = count_by_window(losses["t"], lost_at, size, scenario.horizon)
-    # One integer for each message: the message before it in its direction has that integer less 1,
-    # and the gap after the last of each direction keeps directions apart.
-    width = int(sends["message"].max(initial=0)) + 2
-    keys = lost_at * width + number
-    after_loss = np.isin(keys - 1, keys) & (number > 0)
-    opposite = loss_law(scenario).opposite[lost_at]
-    both_lost = np.isin(opposite * width + number, keys) & (opposite >= 0)
-    followed = number + 1 < sent.sum(axis=0)[lost_at]
-    masks = (followed, after_loss, both_lost)
-    counts = [np.bincount(lost_at[m], minlength=size) for m in masks]
-    is_lost = np.isin(sent_at * width + sends["message"], keys)
+    sends, direction, is_lost, _ = messages
+    sent = count_by_window(sends["t"], direction, size, horizon)
+    lost = count_by_window(sends["t"][is_lost], direction[is_lost], size, horizon)
+    # Of a message and the next one of its direction.
+    first = direction[:-1][is_lost[:-1] & (direction[1:] == direction[:-1])]
+    twice = direction[:-1][is_lost[:-1] & is_lost[1:] & (direction[1:] == direction[:-1])]
+    # Of a message and that of the same number in the opposite direction.
+    back, begins = loss_law(scenario).opposite[direction], np.searchsorted(direction, range(size))
+    has_other = (back >= 0) & (sends["message"] < sent.sum(axis=0)[back])
+    other = np.where(has_other, begins[back] + sends["message"], 0)
+    both = direction[is_lost & has_other & is_lost[other]]
+    counts = [np.bincount(column, minlength=size) for column in (first, twice, both)]
     of_broadcasts = slice(None) if scenario.has_broadcasts else slice(0)
-    pairs = _pairs_of_hearers(sends[of_broadcasts], is_lost[of_broadcasts])
+    hearers = _pairs_of_hearers(sends[of_broadcasts], is_lost[of_broadcasts])
     # Those of hundreds of runs are in memory at once.
     short = np.int16 if sent.max() < 1 << 15 else np.int32
-    return LossCounts(*(column.astype(short) for column in (sent, lost, *counts)), *pairs)
+    return LossCounts(*(column.astype(short) for column in (sent, lost, *counts)), *hearers)
 
 
 def _pairs_of_hearers(sends: np.ndarray, is_lost: np.ndarray) -> list[np.ndarray]:
@@ -281,44 +303,17 @@ def stated_delay(scenario: Scenario) -> tuple[float | None, Any]:
     return stated_part(delay, "delay").fixed, stated_law(delay, "delay")
 
 
-def delays_of(scenario: Scenario, run: Run) -> DelayCounts | None:
+def delays_of(scenario: Scenario, messages: Messages) -> DelayCounts | None:
     """Return counts of delays by direction, None without links or a stated law. Messages that have
     not arrived when the run ends take longer than that.
     """
-    (fixed, law), count = stated_delay(scenario), len(scenario.topology.directions)
-    rows = rows_of(run.log, "deliver", "late")
-    if not count or (fixed is None and law is None):
+    (fixed, law), losses = stated_delay(scenario), loss_law(scenario)
+    if not losses.links or (fixed is None and law is None):
         return None
     if fixed is not None:
-        return count_fixed(rows["age"], fixed)
-    sent, directions, ages = _follow_messages(scenario, run, rows)
-    return count_delays(law, sent, ages, directions, count, scenario.horizon)
-
-
-def _follow_messages(
-    scenario: Scenario, run: Run, arrivals: np.ndarray
-) -> tuple[FloatArray, IntArray, FloatArray]:
-    """Return times of sending, directions and ages (K,) of messages that are not lost."""
-    log, law = run.log, loss_law(scenario)
-    sends, losses = (rows_of(log, kind) for kind in ("send", "lost"))
-    width = int(sends["message"].max(initial=0)) + 1
-
-    def keys(rows: np.ndarray, sender: str, receiver: str) -> IntArray:
-        """Return one integer for each message: its direction, and its number in that."""
-        codes: IntArray = _places(law.links, [rows[sender], rows[receiver]]) * width
-        return codes + np.asarray(rows["message"], dtype=np.int64)
-
-    sent = keys(sends, "node", "peer")
-    # The receiver of a message comes first in the row of its arrival.
-    arrived = keys(arrivals, "peer", "node")
-    followed = ~np.isin(sent, keys(losses, "node", "peer"))
-    second = np.array([i > j for i, j in law.links]) & (law.opposite >= 0) & law.shared
-    followed &= ~second[sent // width]
-    order = np.argsort(sent[followed], kind="stable")
-    sent, times = sent[followed][order], sends["t"][followed][order]
-    ages = np.full(len(sent), np.inf)
-    position = np.searchsorted(sent, arrived)
-    position[position == len(sent)] = 0
-    known = sent[position] == arrived if len(sent) else np.zeros(len(arrived), dtype=bool)
-    ages[position[known]] = arrivals["age"][known]
-    return times, sent // width, ages
+        return count_fixed(messages.age[np.isfinite(messages.age)], fixed)
+    second = np.array([i > j for i, j in losses.links]) & (losses.opposite >= 0) & losses.shared
+    followed = ~messages.lost & ~second[messages.direction]
+    sent, direction = messages.sent["t"][followed], messages.direction[followed]
+    ages, size = messages.age[followed], len(losses.links)
+    return count_delays(law, sent, ages, direction, size, scenario.horizon)

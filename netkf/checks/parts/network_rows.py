@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -15,6 +15,7 @@ from netkf.checks.laws import find, find_largest
 from netkf.checks.parts import events
 from netkf.checks.parts.events import loss_law, stated_delay
 from netkf.checks.parts.samples import PartSamples
+from netkf.core.clock import Entity
 from netkf.core.errors import ScenarioError
 from netkf.laws import delays, losses, ticks
 from netkf.laws.intervals import Comparison, deviation_interval, with_drawn
@@ -47,8 +48,8 @@ MIN_DRAWN_SHARE = 0.1
 """Share of the runs below which so few extra replicas would hardly narrow the intervals."""
 Test = Callable[[PartSamples, float], Finding]
 """A test of a row: a function of the samples of all runs and a level."""
-Draw = Callable[[Scenario, int, int], np.ndarray]
-"""Function of (scenario, seed, replica) that returns the ticks (E,) of all clocks in a replica of
+Draw = Callable[[Scenario, Sequence[Entity], int, int], list[FloatArray]]
+"""Function of (scenario, entities, seed, replica) that returns the ticks of clocks in a replica of
 which nothing else is simulated.
 """
 
@@ -69,7 +70,7 @@ class Clocks(NamedTuple):
 NETWORK = Clocks(
     events.network_clocks,
     "ticks",
-    events.count_drawn_ticks,
+    events.draw_ticks,
     evidence.CLOCKS,
     "clocks tick",
     "ticks",
@@ -77,7 +78,7 @@ NETWORK = Clocks(
 SENSORS = Clocks(
     events.sampling_clocks,
     "sampling",
-    events.count_drawn_samples,
+    events.draw_samples,
     evidence.SAMPLING,
     "sensors sample",
     "samples",
@@ -86,8 +87,12 @@ CONTACT_SENTENCE = "links tick in their contacts only"
 
 
 @lru_cache(maxsize=4)
-def _drawn_counts(draw: Draw, scenario: Scenario, seed: int, first: int, count: int) -> np.ndarray:
-    return np.array([draw(scenario, seed, first + k) for k in range(count)])
+def _drawn_counts(
+    clocks: Clocks, scenario: Scenario, seed: int, first: int, count: int
+) -> np.ndarray:
+    entities, replicas = clocks.group(scenario).entities, range(first, first + count)
+    drawn = (clocks.draw(scenario, entities, seed, replica) for replica in replicas)
+    return np.array([[len(times) for times in ticks] for ticks in drawn])
 
 
 def _number_drawn(group: ClockGroup, horizon: float, runs: float) -> int:
@@ -108,7 +113,7 @@ def _check_rates(clocks: Clocks, samples: PartSamples, level: float) -> Finding:
     counts, runs = windows.sum(axis=1), len(windows)
     further = _number_drawn(group, horizon, runs)
     if further:
-        drawn = _drawn_counts(clocks.draw, scenario, samples.seed, runs, further)
+        drawn = _drawn_counts(clocks, scenario, samples.seed, runs, further)
         counts = np.concatenate([counts, drawn])
     slack = ticks.slack_of_start(group, counts)
 

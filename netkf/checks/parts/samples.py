@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
-
-from netkf.checks.parts.events import delays_of, losses_of, pairs_of, samples_of, ticks_of
+from netkf.checks.parts.events import (
+    delays_of,
+    losses_of,
+    messages_of,
+    pairs_of,
+    samples_of,
+    ticks_of,
+)
 from netkf.checks.parts.noises import plant_noises, reading_noises
+from netkf.laws import stack_runs
 from netkf.laws.delays import DelayCounts
 from netkf.laws.losses import LossCounts, PairCounts
 from netkf.laws.noise import NoiseDraws
@@ -18,53 +24,41 @@ from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
 
+PART_TYPES: dict[str, type[Any]] = {
+    "ticks": TickCounts,
+    "fates": LossCounts,
+    "pairs": PairCounts,
+    "steps": NoiseDraws,
+    "readings": NoiseDraws,
+    "delays": DelayCounts,
+    "sampling": TickCounts,
+}
+"""The statistics of a run: ticks and samples of the clocks of the network and of sensors, losses
+and delays of messages, matchings of slots, and noises of the plant and of the readings.
+"""
 
-class PartSummary(NamedTuple):
-    """Counts and draws of one run for each part; None where the scenario has no such part.
 
-    ticks, sampling : ticks of the clocks of the network and of sampled sensors
-    fates, delays   : losses and delays of messages
-    pairs           : matchings of slots
-    steps, readings : noises of the plant and of the sensors
+def summarise_parts(scenario: Scenario, run: Run) -> dict[str, Any]:
+    """Return counts and draws of a run by the names of PART_TYPES, to compare parts with their
+    laws; without those of parts that the scenario has not. Noises are drawn again.
     """
-
-    ticks: TickCounts | None
-    fates: LossCounts | None
-    pairs: PairCounts | None
-    steps: NoiseDraws | None
-    readings: NoiseDraws | None
-    delays: DelayCounts | None
-    sampling: TickCounts | None
-
-
-PART_TYPES: dict[str, type[Any]] = dict(
-    zip(
-        PartSummary._fields,
-        (TickCounts, LossCounts, PairCounts, NoiseDraws, NoiseDraws, DelayCounts, TickCounts),
-        strict=True,
-    )
-)
-"""The classes of the fields of :class:`PartSummary`."""
-
-
-def summarise_parts(scenario: Scenario, run: Run) -> PartSummary:
-    """Return counts and draws of a run to compare parts with their laws; noises are drawn again."""
-    streams = Streams(run.seed, run.replica)
-    return PartSummary(
-        ticks=ticks_of(scenario, run),
-        fates=losses_of(scenario, run),
-        pairs=pairs_of(scenario, run),
-        steps=plant_noises(scenario, streams),
-        readings=reading_noises(scenario, streams),
-        delays=delays_of(scenario, run),
-        sampling=samples_of(scenario, streams),
-    )
+    streams, messages = Streams(run.seed, run.replica), messages_of(scenario, run)
+    found = {
+        "ticks": ticks_of(scenario, run),
+        "fates": losses_of(scenario, messages),
+        "pairs": pairs_of(scenario, run),
+        "steps": plant_noises(scenario, streams),
+        "readings": reading_noises(scenario, streams),
+        "delays": delays_of(scenario, messages),
+        "sampling": samples_of(scenario, run),
+    }
+    return {name: part for name, part in found.items() if part is not None}
 
 
 @dataclass(frozen=True)
 class PartSamples:
-    """The summaries of R runs of one seed, which all tests of parts get, with the fields of
-    :class:`PartSummary`; the arrays in them have a first axis of length R.
+    """The summaries of R runs of one seed, which all tests of parts get, by the names of
+    PART_TYPES, None without such a part; the arrays in them have a first axis of length R.
     """
 
     scenario: Scenario
@@ -78,12 +72,10 @@ class PartSamples:
     sampling: Any = None
 
 
-def stack_parts(scenario: Scenario, seed: int, summaries: Sequence[PartSummary]) -> PartSamples:
+def stack_parts(
+    scenario: Scenario, seed: int, summaries: Sequence[Mapping[str, Any]]
+) -> PartSamples:
     """Return the ``summaries`` of R runs of ``seed`` as one object for the tests."""
-    columns: dict[str, Any] = {}
-    for name in PartSummary._fields:
-        present = [part for summary in summaries if (part := getattr(summary, name)) is not None]
-        if present:
-            arrays = (np.array(column) for column in zip(*present, strict=True))
-            columns[name] = type(present[0])(*arrays)
+    present = {name: [one[name] for one in summaries if name in one] for name in PART_TYPES}
+    columns = {name: stack_runs(counts) for name, counts in present.items() if counts}
     return PartSamples(scenario, seed, **columns)
