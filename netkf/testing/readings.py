@@ -5,13 +5,12 @@ increments.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from netkf.checks.parts.noises import Pieces, read_pieces
 from netkf.linalg.arrays import FloatArray
-from netkf.plants.diffusion import Diffusion
 from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.rng.streams import Streams
 from netkf.testing.watching import demand, demand_array, guard_user_code
@@ -79,66 +78,32 @@ def make_reader(sensor: Sensor, name: str) -> SensorReader:
     return SensorReader(sensor, name, "samples" if samples else "slot_path")
 
 
-class IncrementPieces(NamedTuple):
-    """Increments over K pieces of steps.
-
-    moments : (K, 2, p), integrals of dy and of P_1 dy over the piece (P_1: Legendre polynomial)
-    spans   : (K, 2), start and end of the piece, seconds
-    step    : (K,), index of the step that the piece belongs to
-    """
-
-    moments: FloatArray
-    spans: FloatArray
-    step: np.ndarray
-
-    @property
-    def gaps(self) -> FloatArray:
-        """Lengths (K, 1) of the pieces in seconds."""
-        return self.spans[:, 1:] - self.spans[:, :1]
-
-    def noise(self, H: FloatArray, x: FloatArray) -> FloatArray:
-        """Return the moments (K, 2, p) without those of ``H x``."""
-        drift = self.gaps * (H @ x)
-        return self.moments - np.stack([drift, np.zeros_like(drift)], axis=1)
-
-
 class IncrementReader(SensorReader):
     """Reads the increments of a sensor of a constant state, over steps that may be cut."""
 
     def __init__(self, sensor: Any, name: str) -> None:
         super().__init__(sensor, name, "path")
 
-    def read_pieces(
-        self, streams: Streams, node: int, x: FloatArray, steps: int, cut: bool
-    ) -> IncrementPieces:
+    def read(self, streams: Streams, node: int, x: FloatArray, steps: int, cut: bool) -> Pieces:
         """Return increments over ``steps`` at a constant ``x`` (n,), each ``cut`` or not."""
-        generator, A = generators(streams, node), np.zeros((self.n, self.n))
-        plant = Diffusion(mean=x, A=A, B=A[:, :1], sensing_period=STEP)
-        all_moments, spans, step = [], [], []
+        generator, still = generators(streams, node), np.stack([x, np.zeros_like(x)])
         with guard_user_code(self.where):
-            truth = plant.path(generator("plant"), generator("probe"), np.empty(0))
             path = self.sensor.path(generator("noise"), generator("cut"))
-            for k in range(steps):
-                first, last = truth.grid(k), truth.grid(k + 1)
-                shares = CUTS[k % len(CUTS)] if cut else ()
-                times = [first, *(first + share * (last - first) for share in shares), last]
-                for start, end in pairwise(times):
-                    moments = path.moments(truth, truth.moments(start, end), start, end)
-                    all_moments.append(demand_array(self.where, "moments", moments, (2, self.p)))
-                    spans.append((start, end))
-                    step.append(k)
-        return IncrementPieces(np.array(all_moments), np.array(spans), np.array(step))
+            pieces = read_pieces(path, STEP, steps, CUTS if cut else CUTS[:1], lambda g: g * still)
+        shape = (len(pieces.step), 2, self.p)
+        return pieces._replace(moments=demand_array(self.where, "moments", pieces.moments, shape))
 
-    def combine(self, pieces: IncrementPieces) -> FloatArray:
-        """Return the moments (S, 2, p) of increments over whole steps."""
-        total = np.zeros((int(pieces.step[-1]) + 1, 2, self.p))
-        for moments, (start, end), k in zip(*pieces, strict=True):
-            # On a piece, P_1 of the step is its value in the middle of the piece plus the share of
-            # the piece times P_1 of the piece.
-            middle = ((start - k * STEP) - ((k + 1) * STEP - end)) / STEP
-            total[k, 0] += moments[0]
-            total[k, 1] += middle * moments[0] + (end - start) / STEP * moments[1]
-        return total
+
+def combine(pieces: Pieces) -> FloatArray:
+    """Return the moments (S, 2, p) of increments over whole steps."""
+    total = np.zeros((int(pieces.step[-1]) + 1, *pieces.moments.shape[1:]))
+    for moments, _, (start, end), k in zip(*pieces, strict=True):
+        # On a piece, P_1 of the step is its value in the middle of the piece plus the share of the
+        # piece times P_1 of the piece.
+        middle = ((start - k * STEP) - ((k + 1) * STEP - end)) / STEP
+        total[k, 0] += moments[0]
+        total[k, 1] += middle * moments[0] + (end - start) / STEP * moments[1]
+    return total
 
 
 def demand_matrices(sensor: Any, name: str) -> None:

@@ -31,6 +31,7 @@ from netkf.testing.readings import (
     STEP,
     IncrementReader,
     SensorReader,
+    combine,
     demand_matrices,
     generators,
     make_reader,
@@ -193,28 +194,22 @@ def _check_laws(reader: SensorReader, nodes: tuple[int, ...], seed: int) -> None
 
 def _check_increments(reader: IncrementReader, node: int, seed: int) -> None:
     x, other_x = _make_states(seed, 2, reader.n)
-    streams = Streams(seed)
-    read = partial(reader.read_pieces, streams, node)
+    read = partial(reader.read, Streams(seed), node)
     cut, uncut = (read(x, SHORT_LENGTH, cut=is_cut) for is_cut in (True, False))
     rule = "increments of the pieces of a step must add up to those of the step"
     remedy = "draw the noise of the grid first, and cut it by its conditional law"
-    demand_close(reader.combine(cut), uncut.moments, reader.where, rule, remedy=remedy)
+    demand_close(combine(cut), uncut.moments, reader.where, rule, remedy=remedy)
     repeated = read(x, SHORT_LENGTH, cut=True)
     rule, remedy = "increments must be the same for equal streams", "use only the generators given"
     demand_close(cut.moments, repeated.moments, reader.where, rule, remedy=remedy)
-    other = read(other_x, SHORT_LENGTH, cut=True)
+    other, H = read(other_x, SHORT_LENGTH, cut=True), reader.sensor.H
     rule = "another state must change increments by H times its integral, and the noise not at all"
-    H = reader.sensor.H
-    demand_close(other.noise(H, other_x), cut.noise(H, x), reader.where, rule)
-    factor, noises = whiten(reader.sensor.R).factor, []
-    for run in range(RUNS):
-        pieces = reader.read_pieces(Streams(seed, run), node, x, STEPS, cut=True)
-        # The moments of unit noise over g seconds have the variances g and g / 3.
-        deviations = np.sqrt(pieces.gaps[:, :, None] * np.array([[1.0], [1.0 / 3.0]]))
-        noise = pieces.noise(H, x)
-        noises.append((noise / deviations @ factor.T).reshape(len(noise), -1))
+    demand_close(other.moments - other.x @ H.T, cut.moments - cut.x @ H.T, reader.where, rule)
+    factor, runs = whiten(reader.sensor.R).factor, (Streams(seed, run) for run in range(RUNS))
+    noise = np.array([reader.read(streams, node, x, STEPS, True).noise(H) for streams in runs])
     text = f"the noise of increments (their two moments, over steps of {STEP:g} s)"
-    check_white(np.array(noises), NoiseLabels(reader.where, text, "R"))
+    labels = NoiseLabels(reader.where, text, "R")
+    check_white((noise @ factor.T).reshape(*noise.shape[:2], -1), labels)
 
 
 def _check_regressors(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import bisect
 import dataclasses
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ import numpy as np
 
 from netkf.laws.noise import MIN_VARIANCE_SHARE, NoiseDraws, noise_draws, transition_law, whiten
 from netkf.laws.stating import stated_part
-from netkf.linalg.arrays import FloatArray, square_root
+from netkf.linalg.arrays import FloatArray, IntArray, square_root
 from netkf.plants.curves import NonlinearDiffusion
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant, SlotPlant
@@ -239,8 +239,18 @@ def _whitened_noises(
         path = scenario.sensors[law.placed_sensor.entry].path(
             *(streams.generator(purpose, node, ordinal) for purpose in ("noise", "cut"))
         )
-        noises, x = _increment_noises(scenario, path, law, draw)
-        return noises, _standardise(x, sizes)
+        period = scenario.diffusion.sensing_period
+        assert period is not None
+        assert law.H is not None
+        steps = min(MAX_STEPS // 4, int(scenario.horizon / period))
+        if not steps:
+            return np.empty((0, len(law.root))), draw(0)
+        # Whole steps and cut ones take turns.
+        pieces = read_pieces(path, period, steps, ((0.3,), ()), lambda gap: gap * draw(2))
+        noise = pieces.noise(law.H).reshape(-1, len(law.root))
+        noises = np.asarray(np.linalg.solve(law.root, noise.T).T, dtype=np.float64)
+        gaps = np.diff(pieces.spans)[:, :, None]
+        return noises, _standardise((pieces.x / gaps).reshape(-1, len(sizes)), sizes)
     x = draw(count)
     if not count:  # a run may be shorter than the first gap of the sensor
         return np.empty((0, len(law.root))), x
@@ -268,27 +278,47 @@ class _Grid(NamedTuple):
         return self.end
 
 
-def _increment_noises(
-    scenario: Scenario, path: Any, law: SensorLaw, draw: Callable[[int], FloatArray]
-) -> tuple[FloatArray, FloatArray]:
-    """Return whitened noises (S, p) of a continuous sensor's increments, and states (S, n)."""
-    period, noises, states = scenario.diffusion.sensing_period, [], []
-    assert period is not None
-    assert law.H is not None
-    for k in range(min(MAX_STEPS // 4, int(scenario.horizon / period))):
-        start, end = k * period, (k + 1) * period
-        # Whole steps and cut ones take turns.
-        for piece_end in [end] if k % 2 else [start + 0.3 * period, end]:
-            x = draw(2)
-            x_integral = x * (piece_end - start)
-            dy = path.moments(_Grid(period, end), x_integral, start, piece_end)
-            # The moments of unit noise over g seconds have the variances g and g / 3.
-            scale = np.sqrt((piece_end - start) * np.array([[1.0], [1.0 / 3.0]]))
-            noises.append(np.linalg.solve(law.root, ((dy - x_integral @ law.H.T) / scale).T).T)
-            states.append(x)
-            start = piece_end
-    p, n = law.H.shape
-    return np.reshape(noises, (-1, p)), np.reshape(states, (-1, n))
+class Pieces(NamedTuple):
+    """Increments over K pieces of steps.
+
+    moments : (K, 2, p), integrals of dy and of P_1 dy over the piece (P_1: Legendre polynomial)
+    x       : (K, 2, n), the same of x dt
+    spans   : (K, 2), start and end of the piece, seconds
+    step    : (K,), index of the step that the piece belongs to
+    """
+
+    moments: FloatArray
+    x: FloatArray
+    spans: FloatArray
+    step: IntArray
+
+    def noise(self, H: FloatArray) -> FloatArray:
+        """Return the moments (K, 2, p) without those of ``H x``, in units of their deviations."""
+        gaps = (self.spans[:, 1] - self.spans[:, 0])[:, None, None]
+        # The moments of unit noise over g seconds have the variances g and g / 3.
+        unit = np.sqrt(gaps * np.array([[1.0], [1.0 / 3.0]]))
+        return np.asarray((self.moments - self.x @ H.T) / unit)
+
+
+def read_pieces(
+    path: Any,
+    period: float,
+    steps: int,
+    cuts: Sequence[Sequence[float]],
+    draw: Callable[[float], FloatArray],
+) -> Pieces:
+    """Return the increments of a continuous sensor's ``path`` over ``steps`` of ``period`` seconds,
+    which are cut at the shares ``cuts`` in turn, of states with the moments ``draw(gap)`` (2, n).
+    """
+    pieces = []
+    for k in range(steps):
+        first, last = k * period, (k + 1) * period
+        times = [first, *(first + share * period for share in cuts[k % len(cuts)]), last]
+        for start, end in itertools.pairwise(times):
+            x = draw(end - start)
+            moments = np.asarray(path.moments(_Grid(period, last), x, start, end))
+            pieces.append((moments, x, (start, end), k))
+    return Pieces(*(np.array(column) for column in zip(*pieces, strict=True)))
 
 
 def whitened_starts(scenario: Scenario, x: FloatArray) -> FloatArray:
