@@ -13,7 +13,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.testing.observed import Seen
 from netkf.testing.parents import check_parent
 from netkf.testing.small_runs import run, setups
-from netkf.testing.watching import WatchedPart, demand, make_part
+from netkf.testing.watching import WatchedPart, is_number, make_part
 
 MAX_DEGREE = 8  # weights are checked for all pairs of degrees up to it
 SHIFT_TOLERANCE = 1e-9  # relative to the estimates before the shift is subtracted
@@ -63,106 +63,93 @@ def check_filter(filter: Any, /, same_as_parent: bool | None = None, **settings:
 
 def _check_shift(watched: WatchedPart, seen: list[Seen], shifted: list[Seen]) -> None:
     # Simulations of growing states move the truth back to 0, and all estimates with it.
+    rule = "a class that defines shift must commute with a shift of the truth"
+    remedy = "correct shift, of states and of payloads, or do not define it"
     for one, other in zip(seen, shifted, strict=True):
         pairs = [("xhat", one.xhat, other.xhat, 1.0 + one.size + other.size)]
         if one.P is not None and other.P is not None:
             pairs.append(("P", one.P, other.P, 1.0 + float(np.abs(one.P).max())))
         for name, mine, moved, size in pairs:
             difference = float(np.abs(mine - moved).max())
-            demand(
-                difference <= SHIFT_TOLERANCE * size,
-                f"{watched.name}.shift",
-                "a class that defines shift must commute with a shift of the truth",
-                f"{name} of node {one.node} after {one.after} that differs by {difference:.3g} "
-                "once truth, states and payloads are shifted",
-                "correct shift, of states and of payloads, or do not define it",
-            )
+            got = f"{name} of node {one.node} after {one.after} that differs by {difference:.3g}"
+            got += " once truth, states and payloads are shifted"
+            watched.demand("shift", difference <= SHIFT_TOLERANCE * size, rule, got, remedy)
 
 
 def _check_values(watched: WatchedPart) -> None:
-    part, name = watched.part, f"{watched.name}.timing"
-    _check_flags(part.needs, Needs, f"{watched.name}.needs")
-    _check_flags(part.timing, Timing, name)
-    clocks = part.timing.clocks
+    part, demand = watched.part, watched.demand
+    _check_flags(watched, "needs", part.needs, Needs)
+    _check_flags(watched, "timing", part.timing, Timing)
+    clocks, slot = part.timing.clocks, part.timing.first_exchange
     are_clocks = isinstance(clocks, tuple) and set(clocks) <= set(CLOCKS)
     text = ", ".join(f'"{clock}"' for clock in CLOCKS)
-    demand(are_clocks, f"{name}.clocks", f"must be a tuple of {text}", clocks)
+    demand("timing.clocks", are_clocks, f"must be a tuple of {text}", clocks)
     can_run = bool(clocks) or part.timing.schedule is not None or not part.timing.talks
     rule = "must name a clock where schedule is None: the filter could not run at all"
-    demand(can_run, f"{name}.clocks", rule, clocks)
-    slot = part.timing.first_exchange
+    demand("timing.clocks", can_run, rule, clocks)
     is_count = isinstance(slot, int) and slot >= 0
-    demand(is_count, f"{name}.first_slot", "must be a whole number of at least 0", slot)
+    demand("timing.first_slot", is_count, "must be a whole number of at least 0", slot)
 
 
-def _check_flags(value: Any, kind: type[Any], where: str) -> None:
-    demand(isinstance(value, kind), where, f"must be a {kind.__name__} of netkf.parts", value)
-    for field in dataclasses.fields(kind):
-        got = getattr(value, field.name)
-        is_flag = isinstance(field.default, bool)
-        demand(
-            not is_flag or isinstance(got, bool),
-            f"{where}.{field.name}",
-            "must be True or False",
-            got,
-        )
+def _check_flags(watched: WatchedPart, name: str, value: Any, kind: type[Any]) -> None:
+    rule = f"must be a {kind.__name__} of netkf.parts"
+    watched.demand(name, isinstance(value, kind), rule, value)
+    flags = [field.name for field in dataclasses.fields(kind) if isinstance(field.default, bool)]
+    for flag in flags:
+        got = getattr(value, flag)
+        watched.demand(f"{name}.{flag}", isinstance(got, bool), "must be True or False", got)
 
 
 def _check_schedule(watched: WatchedPart) -> None:
-    name = f"{watched.name}.timing"
-    schedule, where = watched.part.timing.schedule, f"{name}.schedule"
+    schedule, demand = watched.part.timing.schedule, watched.demand
     are_phases = isinstance(schedule, tuple) and set(schedule) <= set(PHASES)
     text = ", ".join(f'"{phase}"' for phase in PHASES)
-    demand(are_phases, where, f"must be None or a tuple of {text}", schedule)
+    demand("timing.schedule", are_phases, f"must be None or a tuple of {text}", schedule)
+    rule = 'must have one "predict" and one "sense" at most'
     no_repeats = max(schedule.count("predict"), schedule.count("sense")) <= 1
-    demand(no_repeats, where, 'must have one "predict" and one "sense" at most', schedule)
-    _check_predicts(watched, schedule)
+    demand("timing.schedule", no_repeats, rule, schedule)
+    if {"predict", "sense"} <= set(schedule):
+        is_later = schedule.index("sense") < schedule.index("predict")
+        rule = 'must be True where the schedule has "predict" after "sense", and False where before'
+        remedy = "else estimates are compared with the state of another slot"
+        got = watched.part.timing.predicts
+        demand("timing.predicts", got is is_later, rule, got, remedy)
     for phase in range(schedule.count("exchange")):
         steps = watched.call("timing.steps", phase)
         is_count = isinstance(steps, int) and steps >= 1
-        demand(is_count, f"{name}.steps", "must be a whole number of at least 1", steps)
+        demand("timing.steps", is_count, "must be a whole number of at least 1", steps)
         redraws = watched.call("timing.redraws", phase, 0)
         rule, remedy = "must be True in step 0", "links have no outcome yet"
-        demand(redraws is True, f"{name}.redraws", rule, redraws, remedy)
-
-
-def _check_predicts(watched: WatchedPart, schedule: tuple[str, ...]) -> None:
-    if not {"predict", "sense"} <= set(schedule):
-        return
-    predicts = schedule.index("sense") < schedule.index("predict")
-    rule = 'must be True where the schedule has "predict" after "sense", and False where before'
-    got = watched.part.timing.predicts
-    remedy = "else estimates are compared with the state of another slot"
-    demand(got is predicts, f"{watched.name}.timing.predicts", rule, got, remedy)
+        demand("timing.redraws", redraws is True, rule, redraws, remedy)
 
 
 def _check_weights(watched: WatchedPart) -> None:
-    name = f"{watched.name}.link_weights"
-    given, where = watched.part.link_weights, f"{name}.of"
-    _check_flags(given, Weights, name)
+    given, demand = watched.part.link_weights, watched.demand
+    _check_flags(watched, "link_weights", given, Weights)
     largest = given.largest_degree
-    demand(largest >= 1.0, f"{name}.largest_degree", "must be at least 1", largest)
+    demand("link_weights.largest_degree", largest >= 1.0, "must be at least 1", largest)
     if given.matrix is not None:
-        _check_matrix(f"{name}.matrix", np.asarray(given.matrix))
+        _check_matrix(watched, np.asarray(given.matrix))
         return
     degrees = range(1, int(min(largest, MAX_DEGREE)) + 1)
     for degree in degrees:
         weights = [watched.call("link_weights.of", degree, peer_degree) for peer_degree in degrees]
         for peer_degree, weight in zip(degrees, weights, strict=True):
-            is_weight = isinstance(weight, (int, float, np.floating)) and 0.0 <= weight <= 1.0
             rule = f"must be a number from 0 to 1 for {degree} and {peer_degree} links"
-            demand(is_weight, where, rule, weight)
+            is_weight = is_number(weight) and 0.0 <= weight <= 1.0
+            demand("link_weights.of", is_weight, rule, weight)
         rule = "the weights of all messages that may arrive together must sum to at most 1"
         got = f"{degree * max(weights):.4g} at a node of {degree} links"
         remedy = "give smaller weights, or let largest_degree say how many links are allowed"
-        demand(degree * max(weights) <= 1.0 + 1e-9, where, rule, got, remedy)
+        demand("link_weights.of", degree * max(weights) <= 1.0 + 1e-9, rule, got, remedy)
 
 
-def _check_matrix(where: str, weights: FloatArray) -> None:
+def _check_matrix(watched: WatchedPart, weights: FloatArray) -> None:
+    demand, where = watched.demand, "link_weights.matrix"
     is_square = weights.ndim == 2 and weights.shape[0] == weights.shape[1]
-    demand(is_square, where, "must be a square matrix", str(weights.shape))
-    demand((weights >= 0.0).all(), where, "must not be negative", float(weights.min()))
+    demand(where, is_square, "must be a square matrix", str(weights.shape))
+    demand(where, (weights >= 0.0).all(), "must not be negative", float(weights.min()))
     sums = weights.sum(axis=0)
     rule = "columns, the weights that a node gives, must sum to at most 1"
     remedy = "entry [l, i] is the weight node i gives to what node l sends"
-    demand((sums <= 1.0 + 1e-9).all(), where, rule, sums, remedy)
+    demand(where, (sums <= 1.0 + 1e-9).all(), rule, sums, remedy)

@@ -7,6 +7,7 @@ import pickle
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -185,8 +186,8 @@ class Observed(Filter):
         self._begin(exchange)
         pair = self.watched.call("emit", state.state, exchange)
         is_pair = type(pair) is tuple and len(pair) == 2
-        where = f"{self.watched.name}.emit"
-        demand(is_pair, where, "must return (state, payload); payload None sends nothing")
+        rule = "must return (state, payload); payload None sends nothing"
+        self.watched.demand("emit", is_pair, rule)
         own = self._note(state._replace(state=pair[0]), "emit")
         if pair[1] is None:
             return own, None
@@ -254,13 +255,13 @@ class Observed(Filter):
         log.waiting = set(log.states) if self.period else set()
 
     def _sums(self) -> dict[str, float]:
-        where = f"{self.watched.name}.analysis.conserved"
         by_node = [
             self.watched.call("analysis.conserved", state) for state in self.log.states.values()
         ]
         names = by_node[0].keys() if isinstance(by_node[0], dict) else None
         same_names = all(isinstance(terms, dict) and terms.keys() == names for terms in by_node)
-        demand(same_names, where, "must name the same quantities at every node", by_node[0])
+        rule = "must name the same quantities at every node"
+        self.watched.demand("analysis.conserved", same_names, rule, by_node[0])
         return {
             name: math.fsum(np.concatenate([np.atleast_1d(terms[name]) for terms in by_node]))
             for name in by_node[0]
@@ -268,62 +269,56 @@ class Observed(Filter):
 
     def _check_conserved(self, lost: str) -> None:
         after = self._sums()
+        remedy = "let absorb give to one node what it takes from another"
         for name, total in self.log.sums.items():
-            demand(
-                abs(after[name] - total) <= TOLERANCE * max(abs(total), 1.0),
-                f"{self.watched.name}.analysis.conserved",
-                f"the sum of {name} over all nodes must survive an exchange with {lost} lost",
-                f"{total:.6g} before and {after[name]:.6g} after",
-                "let absorb give to one node what it takes from another",
-            )
+            survives = abs(after[name] - total) <= TOLERANCE * max(abs(total), 1.0)
+            rule = f"the sum of {name} over all nodes must survive an exchange with {lost} lost"
+            got = f"{total:.6g} before and {after[name]:.6g} after"
+            self.watched.demand("analysis.conserved", survives, rule, got, remedy)
 
     def _has_stopped(self, state: Any) -> bool:
         stopped = self.watched.call("analysis.stopped", state)
         is_flag = stopped is True or stopped is False
-        where = f"{self.watched.name}.analysis.stopped"
-        demand(is_flag, where, "must be True or False", stopped)
+        self.watched.demand("analysis.stopped", is_flag, "must be True or False", stopped)
         return bool(stopped)
 
     def _checked_interval(self, seconds: float) -> float:
-        where = f"{self.watched.name}.timing.interval"
-        demand(seconds > 0.0, where, "must be above 0 seconds", seconds)
+        self.watched.demand("timing.interval", seconds > 0.0, "must be above 0 seconds", seconds)
         return seconds
 
     def _check_composition(self, state: Any, n: int) -> None:
-        watched = self.watched
+        predict = partial(self.watched.call, "predict")
+        rule = "must compose over gaps, predict(a + b) = predict(b) after predict(a)"
+        remedy = (
+            "solve over the gap exactly, as state.model.predict does, and keep no count of calls"
+        )
         for first, second in GAPS:
-            in_one_step = watched.call("predict", state, first + second)
-            in_two_steps = watched.call("predict", watched.call("predict", state, first), second)
-            estimates = [
-                check_estimate(watched, predicted, n, "predict")
-                for predicted in (in_one_step, in_two_steps)
-            ]
-            for name, one, other in zip(("xhat", "P"), *estimates, strict=True):
+            in_one_step = predict(state, first + second)
+            in_two_steps = predict(predict(state, first), second)
+            both = (
+                check_estimate(self.watched, s, n, "predict") for s in (in_one_step, in_two_steps)
+            )
+            for name, (one, other) in zip(("xhat", "P"), zip(*both, strict=True), strict=True):
                 if one is None or other is None:
                     continue
-                difference = float(np.abs(one - other).max())
                 size = max(float(np.abs(one).max()), float(np.abs(other).max()), 1e-300)
-                demand(
-                    difference <= COMPOSITION_TOLERANCE * size,
-                    f"{watched.name}.predict",
-                    "must compose over gaps, predict(a + b) = predict(b) after predict(a)",
-                    f"{name} that differs by {difference / size:.2g} of its size at a = {first:g} "
-                    f"and b = {second:g} s",
-                    "solve over the gap exactly, as state.model.predict does, and keep no count "
-                    "of calls",
-                )
+                difference = float(np.abs(one - other).max()) / size
+                got = f"{name} that differs by {difference:.2g} of its size at a = {first:g}"
+                got += f" and b = {second:g} s"
+                is_same = difference <= COMPOSITION_TOLERANCE
+                self.watched.demand("predict", is_same, rule, got, remedy)
 
     def _check_pickled(self, state: Any) -> None:
-        where = f"{self.watched.name}.init"
         try:
             copy = pickle.loads(pickle.dumps(state))
         except Exception as error:
             raise AssertionError(
-                f"{where}: states must be picklable; got {type(error).__name__}: {error}; make the "
-                "state a NamedTuple of arrays at the top level of a module"
+                f"{self.watched.name}.init: states must be picklable; got {type(error).__name__}: "
+                f"{error}; make the state a NamedTuple of arrays at the top level of a module"
             ) from error
         one, other = (collect_leaves(self.watched.part.estimate(s)) for s in (state, copy))
-        demand(differing_path(one, other) is None, where, "states must be equal after pickling")
+        is_same = differing_path(one, other) is None
+        self.watched.demand("init", is_same, "states must be equal after pickling")
 
 
 def check_estimate(
