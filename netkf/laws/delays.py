@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 
 from netkf.core.laws import WaitingLaw
-from netkf.laws.intervals import Comparison, Interval, detectable_shift, deviation_interval
+from netkf.laws.intervals import Comparison, Interval, deviation_interval, normal_interval
 from netkf.laws.losses import MIN_COUNT, direction_label
 from netkf.laws.waiting import (
     CELLS,
@@ -81,8 +80,7 @@ def compare_delays(
         single = level / (3.0 * len(frequent))
         # The mean of numbers that are uniform has the variance 1 / (12 N), and is nearly normal.
         mean, deviation = 0.5 + excess[k] / number[k], 1.0 / np.sqrt(12.0 * number[k])
-        reach = -float(scipy.special.ndtri(single / 2.0)) * deviation
-        interval = Interval(mean, mean - reach, mean + reach, detectable_shift(deviation, single))
+        interval = normal_interval(mean, deviation, single)
         distances.append((deviation_interval(0.5, interval), direction_label(links[k])))
     correlation = neighbour_correlation(counts.products, level / 3.0)
     if correlation is not None:

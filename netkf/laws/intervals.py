@@ -107,6 +107,25 @@ def noncentrality(freedom: float, critical: float) -> float:
     return 0.5 * (low + high)
 
 
+def normal_interval(value: float, deviation: float, level: float) -> Interval:
+    """Return the interval of a normal estimate ``value`` with a known standard ``deviation``."""
+    reach = -deviation * float(scipy.special.ndtri(level / 2.0))
+    return Interval(value, value - reach, value + reach, detectable_shift(deviation, level))
+
+
+def excess_interval(
+    expected: float, excess: FloatArray, total: float, min_variance: float, level: float
+) -> Interval:
+    """Return the interval of the distance of a share of ``total`` events from the ``expected`` one,
+    from how many more than expected there were in each of R runs, ``excess`` (R,). Rare events may
+    vary too little by chance: the sum has at least ``min_variance``, and that of one event.
+    """
+    runs = len(excess)
+    spread = math.sqrt(max(float(excess.var(ddof=1)) * runs, min_variance, 1.0)) / total
+    estimate = expected + float(excess.sum()) / total
+    return deviation_interval(expected, student_interval(estimate, spread, runs, level))
+
+
 def student_interval(value: float, deviation: float, count: float, level: float) -> Interval:
     """Return Student's interval of ``value``, with a ``deviation`` of ``count`` values."""
 

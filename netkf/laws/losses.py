@@ -15,6 +15,7 @@ from netkf.laws.intervals import (
     Comparison,
     Interval,
     deviation_interval,
+    excess_interval,
     probability_interval,
     student_interval,
 )
@@ -147,7 +148,7 @@ def _loss_interval(
     law: LossLaw, sent: np.ndarray, lost: np.ndarray, directions: np.ndarray, level: float
 ) -> Interval:
     q, sent, lost = law.lost[directions], sent[:, directions], lost[:, directions]
-    total, losses, runs = float(sent.sum()), lost.sum(axis=1), len(sent)
+    total, losses = float(sent.sum()), lost.sum(axis=1)
     excess = (lost - sent * q).sum(axis=1)
     expected = float((sent * q).sum()) / total
     if len(directions) == 1 and law.independent:
@@ -164,11 +165,8 @@ def _loss_interval(
     if rare:
         limits = share_of_bounded_runs(excess, sent.sum(axis=1), expected, level)
         return deviation_interval(expected, limits)
-    # Few runs may show too little spread by chance: at least that of one message, and as stated.
     stated = float((sent * (q * (1.0 - q))).sum()) * law.variance_factor
-    spread = math.sqrt(max(float(excess.var(ddof=1)) * runs, stated, 1.0))
-    estimate = expected + float(excess.sum()) / total
-    return deviation_interval(expected, student_interval(estimate, spread / total, runs, level))
+    return excess_interval(expected, excess, total, stated, level)
 
 
 def share_of_bounded_runs(
@@ -214,17 +212,15 @@ def _share_at(centre: float, end: float, limit: float) -> float:
 def compare_bursts(law: LossLaw, counts: LossCounts, level: float) -> Comparison:
     """Compare the probability of a loss after a loss with that of the stated chain."""
     assert law.chain is not None
-    runs, followed = len(counts.sent), counts.followed.sum(axis=1)
+    followed = counts.followed.sum(axis=1)
     total = float(followed.sum())
     if total < MIN_COUNT or np.count_nonzero(followed) < MIN_EVENTS:
         return NO_COMPARISON
     probability = law.chain.lost_twice / float(law.lost.mean())
     excess = counts.repeated.sum(axis=1) - probability * followed
-    # At least the variance of independent pairs: a few rare losses may show no variance.
-    min_variance = max(total * probability * (1.0 - probability), 1.0)
-    spread = math.sqrt(max(float(excess.var(ddof=1)) * runs, min_variance)) / total
-    estimate = probability + float(excess.sum()) / total
-    distance = deviation_interval(probability, student_interval(estimate, spread, runs, level))
+    # At least the variance of independent pairs.
+    independent = total * probability * (1.0 - probability)
+    distance = excess_interval(probability, excess, total, independent, level)
     text = f"{total:,.0f} losses, after which the next message is lost with a probability off"
     return Comparison([(distance, "all directions")], text)
 
@@ -233,14 +229,12 @@ def compare_shares(law: LossLaw, counts: LossCounts, level: float) -> Comparison
     """Compare how often two hearers of a broadcast lose it both, in R runs, with c q + (1 - c) q^2
     for the share c of broadcasts that have one fate and the probability q of a loss.
     """
-    q, runs, pairs = float(law.lost[0]), len(counts.hearers), counts.hearers
+    q, pairs = float(law.lost[0]), counts.hearers
     expected, total = law.share * q + (1.0 - law.share) * q**2, float(pairs.sum())
-    if total < MIN_COUNT or runs < MIN_RUNS:
+    if total < MIN_COUNT or len(pairs) < MIN_RUNS:
         return NO_COMPARISON
     excess = counts.alike - expected * pairs
-    spread = math.sqrt(max(float(excess.var(ddof=1)) * runs, total * expected, 1.0)) / total
-    estimate = expected + float(excess.sum()) / total
-    distance = deviation_interval(expected, student_interval(estimate, spread, runs, level))
+    distance = excess_interval(expected, excess, total, total * expected, level)
     text = f"{total:,.0f} pairs of hearers, which lose a broadcast both with a probability off"
     return Comparison([(distance, "all senders")], text)
 
@@ -298,13 +292,8 @@ def correlation_of_runs(
     weight = float((count * scale).sum())
     if not weight > 0.0 or len(excess) < MIN_RUNS:
         return None
-    values = excess.sum(axis=1)
-    runs = len(values)
-    # At least the variance under independence: rare events may vary less by chance.
-    min_variance = float((count * variance).sum())
-    spread = math.sqrt(max(float(values.var(ddof=1)) * runs, min_variance, 1.0))
-    estimate = float(values.sum()) / weight
-    return deviation_interval(0.0, student_interval(estimate, spread / weight, runs, level))
+    # At least the variance under independence.
+    return excess_interval(0.0, excess.sum(axis=1), weight, float((count * variance).sum()), level)
 
 
 def _links_apart(law: LossLaw, counts: LossCounts, level: float) -> list[tuple[Interval, str]]:

@@ -18,8 +18,8 @@ from netkf.laws.intervals import (
     Comparison,
     Interval,
     correlation_interval,
-    detectable_shift,
     deviation_interval,
+    normal_interval,
     scale_interval,
     student_interval,
 )
@@ -159,10 +159,7 @@ def compare_means(
     for value, count, label in zip(np.nan_to_num(z).sum(axis=(0, 1)), counts, labels, strict=True):
         if count < MIN_COUNT:
             continue
-        mean, deviation = float(value / count), 1.0 / math.sqrt(count)
-        reach = deviation * -float(scipy.special.ndtri(single / 2.0))
-        detectable = detectable_shift(deviation, single)
-        interval = Interval(mean, mean - reach, mean + reach, detectable)
+        interval = normal_interval(float(value / count), 1.0 / math.sqrt(count), single)
         distances.append((deviation_interval(0.0, interval), label))
     text = "largest mean in standard deviations"
     text += ", or correlation with a state," if with_states else ""
