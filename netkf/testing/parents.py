@@ -98,16 +98,15 @@ def largest_difference(child: WatchedPart, parent: WatchedPart) -> Difference | 
             continue  # the parent requires more than the child, such as regular covariances
         if own.xhat.shape == other.xhat.shape:
             unit = "slot" if kind.slots else "round"
-            found += _differences("xhat", own.xhat, other.xhat, unit)
-            found += _differences("P", own.P, other.P, unit)
+            found.append(_difference("xhat", own.xhat, other.xhat, unit))
+            found.append(_difference("P", own.P, other.P, unit))
     return max(found, key=lambda one: one.relative, default=None)
 
 
-def _differences(quantity: str, one: FloatArray, other: FloatArray, unit: str) -> list[Difference]:
-    """Return the largest difference of estimates (T, N, ...), if both have any."""
+def _difference(quantity: str, one: FloatArray, other: FloatArray, unit: str) -> Difference:
+    """Return the largest difference of estimates (T, N, ...), 0 where they are nan."""
     rest = tuple(range(2, one.ndim))
     size = 1.0 + np.abs(one).max(axis=rest) + (np.abs(other).max(axis=rest) if one.ndim < 4 else 0)
     relative = np.nan_to_num(np.abs(one - other).max(axis=rest) / size)
     k, node = np.unravel_index(int(np.argmax(relative)), relative.shape)
-    where = f"at node {node} after {unit} {k}"
-    return [Difference(float(relative[k, node]), quantity, where)]
+    return Difference(float(relative[k, node]), quantity, f"at node {node} after {unit} {k}")

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 
 from netkf.algorithms.traits import Timing
 from netkf.engines.simpy.engine import SimpyEngine
@@ -152,12 +153,11 @@ def run(
     timing, n = watched.part.timing, len(system.M)
     tick = 1.0 if kind.slots else INCREMENT_TICK if kind.increments else SAMPLE_TICK
     A = system.M - np.eye(n)
-    values, vectors = np.linalg.eig(system.M)
-    inverse = np.linalg.inv(vectors)
 
     def transition(seconds: float) -> FloatArray:
-        powers = values ** round(seconds) if kind.slots else np.exp((values - 1.0) * seconds)
-        return np.asarray((vectors * powers @ inverse).real)
+        if kind.slots:
+            return np.linalg.matrix_power(system.M, round(seconds))
+        return np.asarray(scipy.linalg.expm(A * seconds))
 
     since = kind.slots - SLOTS_AFTER_SHIFT if kind.slots else (RELIABLE + 0.5) * tick
     observed = Observed(
