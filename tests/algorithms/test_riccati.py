@@ -21,6 +21,11 @@ SYSTEMS = {  # A, Q, G; the constant-velocity Hamiltonians are defective, R = 0.
     "unstable, precise": (LEAN, DRIVE, np.diag([100.0, 0, 0])),
     "unstable, other": (LEAN, DRIVE, np.diag([0, 0, 20.0])),
     "oscillator": (np.array([[0.0, 1], [-1, 0.1]]), np.diag([0.0, 1]), np.diag([4.0, 0])),
+    "no noise, unstable": (
+        np.array([[0.3, 1, 0], [0, -0.4, 1], [0, 0, -0.9]]),
+        np.zeros((3, 3)),
+        np.eye(3) + 0.5,
+    ),
     "no noise": (np.array([[0.0, 1], [-1, -0.1]]), np.zeros((2, 2)), np.diag([4.0, 0])),
 }
 
@@ -53,16 +58,14 @@ def test_flow_agrees_with_arbitrary_precision(name, gap):
 def test_the_kernel_is_the_formula(seed, n, reads):
     random = np.random.default_rng(seed)
     A, B, C, S = (random.normal(size=(n, n)) for _ in range(4))
-    Q, G, P, x = B @ B.T, C @ C.T * reads, S @ S.T, random.normal(size=n)
+    Q, G, P = B @ B.T, C @ C.T * reads, S @ S.T
     for gap in (0.13, 1.7):
         with reference.precisely():
             triple = reference.flow_triple(*reference.exactly(A, Q, G), gap)
-            exact = reference.flow(*reference.exactly(P, x), triple)
-        expected, moved = (reference.rounded(part) for part in exact)
-        flow = riccati_flow(A, Q, G, gap)
-        found, seen = move_covariances(flow, P), (flow.transition @ x).astype(float)
+            exact, _ = reference.flow(*reference.exactly(P, np.zeros(n)), triple)
+        expected = reference.rounded(exact)
+        found = move_covariances(riccati_flow(A, Q, G, gap), P)
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
-        np.testing.assert_allclose(seen, moved, rtol=0, atol=1e-10 * np.abs(moved).max())
 
 
 @pytest.mark.slow
@@ -79,9 +82,6 @@ def test_flow_composes_over_gaps_and_keeps_covariances(seed, n, first, second):
         twice = move_covariances(part, twice)
     scale = np.abs(once).max() + 1e-12
     assert np.abs(once - twice).max() <= 1e-10 * scale
-    moved = both.transition
-    product = parts[1].transition @ parts[0].transition
-    assert np.abs(moved - product).max() <= 1e-10 * np.abs(moved).max()
     assert np.array_equal(once, once.T)
     assert np.linalg.eigvalsh(once)[0] >= -1e-12 * scale
 

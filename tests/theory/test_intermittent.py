@@ -32,6 +32,17 @@ def test_steady_covariance(name):
     np.testing.assert_allclose(P, case["Pstar"], rtol=0, atol=1e-11 * np.abs(case["Pstar"]).max())
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("seed", range(20))
+def test_without_noise_a_stable_state_is_known_in_the_end(seed):
+    random = np.random.default_rng(seed)
+    n = 2 + seed % 2
+    F, H = np.triu(random.normal(size=(n, n)), 1), random.normal(size=(2, n))
+    assert not theory.steady_covariance(F + 0.6 * np.eye(n), 0.0 * F, H, np.eye(2)).any()
+    # All of a nilpotent F is forgotten after n slots.
+    assert theory.critical_probability(F, H) == (0.0, 0.0)
+
+
 def test_a_rotation_without_noise_has_no_stabilising_fixed_point():
     turn = np.array([[np.cos(0.7), np.sin(0.7)], [-np.sin(0.7), np.cos(0.7)]])
     with warnings.catch_warnings():

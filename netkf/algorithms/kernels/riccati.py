@@ -25,12 +25,18 @@ WIDE = np.longdouble  # extended precision where the machine has it
 WIDE_TERMS = 27  # of an exponential in it, for a norm of at most 1
 
 
+GROWTH, MAX_PARTS = 4.0, 4096
+"""A plant grows by at most e^GROWTH in a part of a gap, of which there are at most so many: G of
+what no noise drives grows by the square of that, and swallows the digits of other modes.
+"""
+
+
 class RiccatiFlow(NamedTuple):
-    """The flow over one gap, in extended precision: matrices (n, n) with ``x -> transition x`` of a
-    mean without readings and ``P -> Q + F P (I + G P)^-1 F'``.
+    """The flow over one gap, in extended precision: so many ``parts`` of it, each with matrices
+    (n, n) of ``P -> Q + F P (I + G P)^-1 F'``.
     """
 
-    transition: FloatArray
+    parts: int
     F: FloatArray
     G: FloatArray
     Q: FloatArray
@@ -70,13 +76,16 @@ def riccati_flow(A: FloatArray, Q: FloatArray, G: FloatArray, gap: float) -> Ric
     """Return the flow of ``dP = A P + P A' + Q - P G P`` over ``gap`` >= 0 seconds; ``A, Q, G`` are
     (n, n). Entries are nan or infinite where an unstable plant overflows.
     """
+    growth = float(np.linalg.eigvals(A).real.max()) * gap
+    parts = int(min(max(math.ceil(growth / GROWTH), 1), MAX_PARTS))
+    gap = gap / parts
     M, scale = hamiltonian(A, Q, G)
-    norm = max(float(np.abs(matrix).sum(axis=0).max()) for matrix in (M, A))
+    norm = float(np.abs(M).sum(axis=0).max())
     # By powers of two, so that halving is exact. Doubling also doubles the relative error: after
     # 2^14 parts a triple in double precision would have lost 1e-12.
     doublings = max(0, math.frexp(norm * gap)[1])
     part = gap / 2.0**doublings
-    transition, (F, G, Q) = wide_exponential(A, part), flow_triple(wide_exponential(M, part))
+    F, G, Q = flow_triple(wide_exponential(M, part))
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(doublings):
             # Symmetry would drift by rounding, and doubling would amplify the drift.
@@ -84,14 +93,9 @@ def riccati_flow(A: FloatArray, Q: FloatArray, G: FloatArray, gap: float) -> Ric
             # Two equal gaps in a row: V = (I + G Q)^-1 joins the noise of the first with the
             # information of the second. G and Q are symmetric, so that V' = (I + Q G)^-1.
             V = wide_inverse(np.eye(len(A)) + G @ Q)
-            transition, F, G, Q = (
-                transition @ transition,
-                F @ V.T @ F,
-                G + F.T @ V @ G @ F,
-                Q + F @ Q @ V @ F.T,
-            )
+            F, G, Q = F @ V.T @ F, G + F.T @ V @ G @ F, Q + F @ Q @ V @ F.T
     # Undo the scaling of hamiltonian().
-    return RiccatiFlow(transition, F, G / scale, Q * scale)
+    return RiccatiFlow(parts, F, G / scale, Q * scale)
 
 
 def move_covariances(flow: RiccatiFlow, P: FloatArray) -> FloatArray:
@@ -99,9 +103,13 @@ def move_covariances(flow: RiccatiFlow, P: FloatArray) -> FloatArray:
     begin, ``P`` (..., n, n).
     """
     with np.errstate(over="ignore", invalid="ignore"):
-        # P (I + G P)^-1 = (I + P G)^-1 P
-        middle = wide_inverse(np.eye(len(flow.G)) + P @ flow.G) @ P
-        return symmetric(flow.Q + flow.F @ middle @ flow.F.T).astype(np.float64)
+        for _ in range(flow.parts):
+            # P (I + G P)^-1 = (I + P G)^-1 P
+            middle = wide_inverse(np.eye(len(flow.G)) + P @ flow.G) @ P
+            P = symmetric(flow.Q + flow.F @ middle @ flow.F.T).astype(np.float64)
+            if not np.isfinite(P).all():
+                break
+        return P
 
 
 def wide_exponential(M: FloatArray, gap: float) -> FloatArray:

@@ -122,8 +122,9 @@ def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) ->
     if hidden is not None:
         raise TheoryError(f"(F, H) is not detectable: the mode with eigenvalue {hidden:.6g}")
     try:
-        P = np.zeros_like(F)  # without readings the step below solves the equation
-        if len(H):
+        P = np.zeros_like(F)
+        # Else the step below solves the equation, where P* may be 0 and rounding all of P.
+        if len(H) and (Q.any() or not growth_factor(F) < 1.0):
             P = symmetric(np.asarray(scipy.linalg.solve_discrete_are(F.T, H.T, Q, R)))
         # One step of Newton's method (Hewer) removes the rounding error of the solver:
         # P+ = (F - K H) P+ (F - K H)' + Q + K R K'.
@@ -327,9 +328,11 @@ class _GainSearch:
         identity = np.eye(n).reshape(-1)[self._pick]
         try:
             # (s - L) X = I on upper triangles
-            X = self._expand @ np.linalg.solve(s * np.eye(len(operator)) - operator, identity)
+            X = np.linalg.solve(s * np.eye(len(operator)) - operator, identity)
         except np.linalg.LinAlgError:
             return None
+        with np.errstate(invalid="ignore"):
+            X = self._expand @ X
         matrix = symmetric(X.reshape(n, n))
         if not np.isfinite(matrix).all() or not np.linalg.eigvalsh(matrix)[0] > 0.0:
             return None
