@@ -1,13 +1,38 @@
-"""Runs in slots with all exchanges that their samples depend on."""
+"""What arrived in the exchanges of runs in slots, with all that their samples depend on."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 
 from netkf.core.errors import EngineError, ScenarioError, TheoryError
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
+from netkf.trace.schema import CODES, rows_of
+
+Step = tuple[int, int, int]
+"""A slot, an exchange in it (phase) and a step of that."""
+
+
+def arrivals_in_slots(
+    scenario: Scenario, run: Run
+) -> Iterator[tuple[Step, int, int, float, float]]:
+    """Yield step, sender, receiver, time of arrival and age (s) of each message that arrived."""
+    rows = rows_of(run.log, "round", "send", "deliver")
+    names = ("kind", "node", "peer", "message", "phase", "t", "age")
+    columns = (scenario.slot_plant.slots_of(rows["t"]), *(rows[name] for name in names))
+    # Matchings have one step, and no rounds.
+    steps, sent = dict[tuple[int, int], int](), dict[Step, Step]()
+    for slot, kind, node, peer, number, phase, t, age in zip(
+        *(column.tolist() for column in columns), strict=True
+    ):
+        if kind == CODES["round"]:
+            steps[slot, phase] = steps.get((slot, phase), -1) + 1
+        elif kind == CODES["send"]:
+            sent[node, peer, number] = slot, phase, steps.get((slot, phase), 0)
+        else:
+            yield sent.pop((peer, node, number)), peer, node, t, age
 
 
 def with_last_exchanges(scenario: Scenario, run: Run) -> Run:

@@ -19,9 +19,9 @@ from netkf.algorithms.translation import Common, state_before
 from netkf.engines.simpy.nodes import View
 from netkf.engines.simpy.slots import SlotSchedule, Stage
 from netkf.linalg.arrays import FloatArray, block_diagonal, square_root
-from netkf.plants.transitions import Transitions
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
+from netkf.theory.common.arrivals import Step, arrivals_in_slots
 from netkf.theory.common.columns import ErrorColumns, LoggedColumns
 from netkf.theory.common.forms import MEAN, NOISE
 from netkf.theory.common.kernel_columns import KernelColumns
@@ -193,7 +193,11 @@ class SlotBlocks(BlockColumns):
         plant = scenario.linear_plant
         self._laws = [(piece.F, square_root(piece.Q)) for piece in plant.pieces]
         self._observe = slot_observations(scenario, run, _apart)
-        self._arrivals = _arrivals(scenario, run)
+        # By slot, phase and step what each receiver heard: sender (twice) and age.
+        self._arrivals: dict[Step, dict[int, list[tuple[int, int, float]]]] = {}
+        for step, sender, receiver, _, age in arrivals_in_slots(scenario, run):
+            heard = self._arrivals.setdefault(step, {}).setdefault(receiver, [])
+            heard.append((sender, sender, age))
         links = scenario.topology.links if scenario.node_filter.timing.talks else ()
         self._talking = sorted({node for link in links for node in link})
 
@@ -254,9 +258,7 @@ class ClockBlocks(BlockColumns, LoggedColumns):
         self._shared = clock is not None and clock.at in ("nodes", "readings")
 
     def _begin_piece(self, piece: int) -> None:
-        plant, self._piece = cast(Any, self._scenario.plant).pieces[piece], piece
-        self._transitions = Transitions(plant.A, plant.B)
-        self._laws: dict[float, tuple[FloatArray, FloatArray]] = {}
+        self._lay_laws(piece)
         for model in self._models:
             if isinstance(model.moving, ChangingFlowModel) and piece < len(model.moving.pieces):
                 model.moving.begin(piece)
@@ -272,10 +274,7 @@ class ClockBlocks(BlockColumns, LoggedColumns):
     def _move_truth(self, time: float) -> None:
         gap = time - self._now
         if gap > 0.0:
-            if gap not in self._laws:
-                F, root = self._transitions.laws(np.array([gap]))
-                self._laws[gap] = F[0], root[0]
-            self._move(*self._laws[gap], (self._now, time))
+            self._move(*self._law(gap), (self._now, time))
             self._now = time
 
     def _predict(self, h: int, time: float) -> None:
@@ -321,27 +320,6 @@ class ClockBlocks(BlockColumns, LoggedColumns):
 def _apart(readings: list[Observation], _: int) -> list[Observation]:
     """Return readings of several sensors as they are: each may be of another block."""
     return readings
-
-
-def _arrivals(
-    scenario: Scenario, run: Run
-) -> dict[tuple[int, int, int], dict[int, list[tuple[int, int, float]]]]:
-    """Return by slot, phase and step what each receiver heard: sender (twice) and age."""
-    log, steps = run.log, dict[tuple[int, int], int]()
-    places: dict[Link, tuple[int, int, int]] = {}
-    arrivals: dict[tuple[int, int, int], dict[int, list[tuple[int, int, float]]]] = {}
-    slots = scenario.slot_plant.slots_of(log["t"]).tolist()
-    names = ("kind", "node", "peer", "message", "phase", "age")
-    columns = (log[name].tolist() for name in names)
-    for slot, kind, node, peer, number, phase, age in zip(slots, *columns, strict=True):
-        if kind == CODES["round"]:
-            steps[slot, phase] = steps.get((slot, phase), -1) + 1
-        elif kind == CODES["send"]:
-            places[node, peer, number] = slot, phase, steps[slot, phase]
-        elif kind == CODES["deliver"]:
-            heard = arrivals.setdefault(places.pop((peer, node, number)), {})
-            heard.setdefault(node, []).append((peer, peer, age))
-    return arrivals
 
 
 def replace_columns(value: Any, width: int, replace: Callable[[FloatArray], FloatArray]) -> Any:

@@ -16,7 +16,6 @@ import numpy as np
 from netkf.engines.compiled.life_tables import life_table
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.network.node_clocks import node_times
-from netkf.plants.transitions import Transitions
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.columns import LoggedColumns
@@ -109,17 +108,10 @@ class ClockColumns(LoggedColumns):
         return not lives or not self._lives.is_down(self._index[node], time)
 
     def _begin_piece(self, piece: int) -> None:
-        scenario, plant = self._scenario, cast(Any, self._scenario.plant).pieces[piece]
-        if piece < len(scenario.model_pieces):
+        if piece < len(self._scenario.model_pieces):
             self._filters.clocked.begin_piece(piece)
-        self._transitions = Transitions(plant.A, plant.B)
-        times = np.unique([0.0, *self._changes, *self._samples, *self._run.times.tolist()])
-        gaps = np.unique(np.diff(times))
-        laws = zip(*self._transitions.laws(gaps), strict=True)
-        # F and the root of the noise of the plant, by gap between readings, samples and changes.
-        self._laws = dict(zip(gaps.tolist(), laws, strict=True))
-        self._flows: IncrementFlows | None = increment_flows(scenario, self.estimators, piece)
-        self._piece = piece
+        self._lay_laws(piece)
+        self._flows: IncrementFlows | None = increment_flows(self._scenario, self.estimators, piece)
 
     def _move_all(self, time: float) -> None:
         self._move_truth(time)
@@ -156,10 +148,7 @@ class ClockColumns(LoggedColumns):
         gap, forms = time - self._now, self._forms_of_all
         if gap <= 0.0 or self._flows is not None:
             return
-        law = self._laws.get(gap)
-        F, root = (
-            law if law is not None else (a[0] for a in self._transitions.laws(np.array([gap])))
-        )
+        F, root = self._law(gap)
         first = forms.inputs(self.n)
         forms.table[self._x, : forms.used] = F @ forms.table[self._x, : forms.used]
         forms.table[self._x, first : first + self.n] = root

@@ -7,12 +7,13 @@ The covariance of all errors is the sum of the products of the columns.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from netkf.algorithms.filter import commutes, compiled_kernels
 from netkf.linalg.arrays import FloatArray
+from netkf.plants.transitions import Transitions
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.observations import Observation
 from netkf.trace.run import Run
@@ -86,9 +87,29 @@ class LoggedColumns(ErrorColumns):
     row, move everything to a time, and begin a piece of the plant, which sets ``_piece``.
     """
 
+    _scenario: Scenario
     _run: Run
     _changes: list[float]
+    _samples: dict[float, Any]
     _piece: int
+
+    def _lay_laws(self, piece: int) -> None:
+        """Compute the laws of a piece of the plant by gap between readings, samples and changes."""
+        plant, self._piece = cast(Any, self._scenario.plant).pieces[piece], piece
+        self._transitions = Transitions(plant.A, plant.B)
+        times = np.unique([0.0, *self._changes, *self._samples, *self._run.times.tolist()])
+        gaps = np.unique(np.diff(times))
+        laws = zip(*self._transitions.laws(gaps), strict=True)
+        self._laws: dict[float, tuple[FloatArray, FloatArray]] = dict(
+            zip(gaps.tolist(), laws, strict=True)
+        )
+
+    def _law(self, gap: float) -> tuple[FloatArray, FloatArray]:
+        """Return F and the root of the plant's noise (n, n) over a gap, in seconds."""
+        if gap not in self._laws:
+            F, root = self._transitions.laws(np.array([gap]))
+            self._laws[gap] = F[0], root[0]
+        return self._laws[gap]
 
     def _rows(self) -> Iterator[tuple[Any, ...]]:
         """Yield the rows of the log, which begin with their times."""
@@ -102,7 +123,7 @@ class LoggedColumns(ErrorColumns):
         raise NotImplementedError
 
     def _begin_piece(self, piece: int) -> None:
-        """Take the laws of a piece of the plant, from its first instant on."""
+        """Take a piece of the plant, from its first instant on."""
         raise NotImplementedError
 
     def replay(self) -> Iterator[None]:

@@ -27,10 +27,10 @@ from netkf.linalg.arrays import FloatArray, square_root
 from netkf.linalg.lanes import LANES, blocks_of
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
+from netkf.theory.common.arrivals import arrivals_in_slots
 from netkf.theory.common.columns import ErrorColumns, padded
 from netkf.theory.common.observations import Observation, slot_observations
 from netkf.trace.run import Run
-from netkf.trace.schema import rows_of
 
 ZERO, MEAN, NOISE = range(3)
 """The first columns: no noise at all, whose entries are those that do not depend on noise; the
@@ -113,7 +113,7 @@ class SlotColumns(ErrorColumns):
         """Replay the events of the run; yield at each of ``run.times``."""
         scenario, run, setup = self._scenario, self._run, self._setup
         talks = scenario.node_filter.timing.talks
-        arrivals = _arrivals(scenario, run, setup, self._lives) if talks else {}
+        arrivals = _used_messages(scenario, run, setup, self._lives) if talks else {}
         predicts, processed = scenario.node_filter.timing.predicts, 0
         for until in scenario.slot_plant.slots_of(run.times).tolist():
             while processed < until:
@@ -285,40 +285,20 @@ def _no_samples(local: FloatArray, blocks: int, filters: SlotFilters) -> SlotSam
     )  # fmt: skip
 
 
-def _arrivals(
+def _used_messages(
     scenario: Scenario, run: Run, setup: SlotSetup, lives: LifeTable
 ) -> dict[int, np.ndarray]:
     """Return by slot which messages were used, (E, W) by exchange and directed link."""
-    log, index = run.log, setup.index_of_direction
-    sends, delivers = (rows_of(log, kind) for kind in ("send", "deliver"))
-    slots, phases = scenario.slot_plant.slots_of(sends["t"]), np.maximum(sends["phase"], 0)
-    first_step = {phase: setup.phases.index(phase) for phase in set(setup.phases)}
-    counts: dict[tuple[int, int, int], int] = {}
     times = step_times(scenario, setup, 0, setup.slots) if len(lives.t) else None
-    phase_of_step = np.array(setup.phases, dtype=np.int64)
-    places: dict[tuple[int, int], tuple[int, int]] = {}
-    columns = (slots, phases, *(sends[name] for name in ("node", "peer", "message", "t")))
-    for slot, phase, node, peer, number, t in zip(*(c.tolist() for c in columns), strict=True):
-        w = index[node, peer]
-        if times is not None:
-            # Who was down in a repetition did not send in it.
-            passed = int(((phase_of_step == phase) & (times.begin[slot] < t)).sum())
-            counts[slot, phase, w] = max(counts.get((slot, phase, w), 0), passed)
-        # A link sends once in each repetition of an exchange.
-        step = counts.get((slot, phase, w), 0)
-        counts[slot, phase, w] = step + 1
-        places[w, number] = slot, first_step[phase] + step
-    shape = len(setup.fresh), len(setup.directions)
-    arrivals: dict[int, np.ndarray] = {}
-    columns = tuple(delivers[name] for name in ("t", "node", "peer", "message"))
-    nodes = scenario.topology.index
-    for t, node, peer, number in zip(*(c.tolist() for c in columns), strict=True):
-        w = index[peer, node]
-        slot, step = places[w, number]
+    index, shape = scenario.topology.index, (len(setup.fresh), len(setup.directions))
+    used: dict[int, np.ndarray] = {}
+    for (slot, phase, number), sender, receiver, t, _ in arrivals_in_slots(scenario, run):
+        step = setup.phases.index(max(phase, 0)) + number
         if times is not None:
             # Who goes down before the step ends has lost what arrived.
-            changes = lives.t[lives.node == nodes[node]]
+            changes = lives.t[lives.node == index[receiver]]
             if ((changes > t) & (changes <= times.end[slot, step])).any():
                 continue
-        arrivals.setdefault(slot, np.zeros(shape, dtype=np.uint8))[step, w] = 1
-    return arrivals
+        w = setup.index_of_direction[sender, receiver]
+        used.setdefault(slot, np.zeros(shape, dtype=np.uint8))[step, w] = 1
+    return used
