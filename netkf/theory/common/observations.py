@@ -14,6 +14,7 @@ import numpy as np
 from netkf.linalg.arrays import FloatArray, as_kernel_array, block_diagonal
 from netkf.plants.readings import covariance_of
 from netkf.rng.streams import Streams
+from netkf.scenario.model import PlacedSensor
 from netkf.scenario.sampling import sample_path, sample_times
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
@@ -101,16 +102,11 @@ def _are_the_same(some: list[Observation], others: list[Observation]) -> bool:
     )
 
 
-def everyone(_node: int, _when: Any) -> bool:
-    """Return True: nodes are never down."""
-    return True
-
-
 def slot_observations(
     scenario: Scenario,
     run: Run,
     join: Callable[..., Any] = stack_observations,
-    is_up: Callable[[int, int], bool] = everyone,
+    is_up: Callable[[int, int], bool] = lambda *_: True,
 ) -> Callable[[int], dict[int, Any]]:
     """Return a function from an increasing slot to its readings by estimator, as ``join`` makes
     them, of nodes that ``is_up(id, slot)``.
@@ -155,13 +151,16 @@ def timed_observations(
     scenario: Scenario,
     streams: Streams,
     join: Callable[..., Any] = stack_observations,
-    is_up: Callable[[int, float], bool] = everyone,
+    is_up: Callable[[int, float], bool] = lambda *_: True,
+    chosen: Callable[[PlacedSensor], bool] = lambda _: True,
 ) -> dict[float, dict[int, Any]]:
     """Return sampled readings by time (s) and estimator, as ``join`` makes them, of nodes that
-    ``is_up(id, time)``.
+    ``is_up(id, time)`` and of ``chosen`` sensors.
     """
-    n, by_node, noises = scenario.plant.n, scenario.sampled_sensors, _noises(scenario)
-    times = sample_times(scenario, streams)
+    by_node = {node: [*filter(chosen, own)] for node, own in scenario.sampled_sensors.items()}
+    if not any(by_node.values()):
+        return {}
+    n, noises, times = scenario.plant.n, _noises(scenario), sample_times(scenario, streams)
     fixed = [
         Observation(sensor.H, *noise)
         for sensor, noise in zip(scenario.sensors, noises, strict=True)

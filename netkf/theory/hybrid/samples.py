@@ -6,7 +6,6 @@ reading at a known time makes M jump to g(M); docs/poisson_samples.md has the pr
 
 from __future__ import annotations
 
-import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,14 +14,12 @@ import scipy
 from netkf.core.clock import Clock
 from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import LinkClock, Periodic
-from netkf.plants.readings import covariance_of
 from netkf.plants.sampling import RecordedSampling
 from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.rng.streams import Streams
 from netkf.scenario.model import PlacedSensor
-from netkf.scenario.sampling import sample_path, sample_times
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.observations import Observation, stack_observations
+from netkf.theory.common.observations import Observation, timed_observations
 from netkf.theory.hybrid.dense import FullMatrix, SparseOrFull, full_matrix
 
 MAX_FULL = 100  # nodes up to which weights are a full matrix
@@ -151,39 +148,18 @@ def poisson_samples(scenario: Scenario) -> tuple[PoissonSamples, ...]:
 
 def sample_jumps(scenario: Scenario) -> tuple[SampleJump, ...]:
     """Return the samples at known times below the horizon, in the order of time."""
-    placed_sensors = {
-        (node, placed_sensor.ordinal): placed_sensor
-        for node, sensors_of_node in scenario.sampled_sensors.items()
-        for placed_sensor in sensors_of_node
-        if has_known_times(scenario.sensors[placed_sensor.entry])
-    }
-    if not placed_sensors:
-        return ()
     # Known times do not depend on the seed; a varying H does, and is that of the scenario's seed.
-    streams, n = Streams(scenario.seed), scenario.plant.n
-    times, index = sample_times(scenario, streams), scenario.topology.index
-    by_time: dict[float, dict[int, list[Observation]]] = {}
-    for (node, ordinal), placed_sensor in placed_sensors.items():
-        sensor = scenario.sensors[placed_sensor.entry]
-        path = sample_path(scenario, streams, node, placed_sensor) if sensor.varying else None
-        R = scenario.noise_covariance(placed_sensor.entry, believed=True)
-        for k, time in enumerate(times[node, ordinal].tolist()):
-            H = sensor.H if path is None else path.reading(k, np.zeros(n))[1]
-            own = covariance_of(path, k, R)
-            # The bound has no true noise: R only fills the field of its root.
-            by_time.setdefault(time, {}).setdefault(index[node], []).append(
-                Observation(H, own, own)
-            )
-    everyone = list(range(len(scenario.nodes)))
-    jumps, link_weights = [], _mean_link_weights(scenario)
-    for time in sorted(by_time):
-        observations = {
-            node: stack_observations(readings, n) for node, readings in by_time[time].items()
-        }
-        sends = np.isin(everyone, list(observations))
+    by_time = timed_observations(
+        scenario,
+        Streams(scenario.seed),
+        chosen=lambda placed: has_known_times(scenario.sensors[placed.entry]),
+    )
+    jumps, nodes = [], range(len(scenario.nodes))
+    link_weights: Any = _mean_link_weights(scenario) if by_time else full_matrix(0, 0)
+    for time, observations in sorted(by_time.items()):
+        sends = np.isin(nodes, list(observations))
         weights = (link_weights * sends).toarray() if link_weights.nnz else None
-        if scenario.filter.algorithm.timing.pooled:
-            joint = stack_observations(list(itertools.chain(*by_time[time].values())), n)
-            observations = dict.fromkeys(everyone, joint)
-        jumps.append(SampleJump(time, observations, weights))
+        pooled = scenario.filter.algorithm.timing.pooled
+        used = dict.fromkeys(nodes, observations[0]) if pooled else observations
+        jumps.append(SampleJump(time, used, weights))
     return tuple(jumps)
