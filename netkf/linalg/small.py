@@ -87,15 +87,6 @@ def swap_rows(a: FloatArray, i: int, k: int, first: int, last: int) -> None:
         a[i, j], a[k, j] = a[k, j], a[i, j]
 
 
-@kernel(allocates=True)
-def solve(left: FloatArray, right: FloatArray) -> FloatArray:
-    """Return ``left^-1 right`` (n, c) of (n, n) and (n, c); nan if it is singular or overflows."""
-    # Copies, since the elimination overwrites both.
-    out = right.copy()
-    solve_inplace(left.copy(), out, len(left))
-    return out
-
-
 @kernel
 def copy_matrix(target: FloatArray, source: FloatArray) -> None:
     """Copy ``source`` (r, c) into ``target`` (>= r, >= c)."""

@@ -29,16 +29,15 @@ def test_products(seed, n):
 def test_solutions(seed, n):
     left, right = drawn(seed, (n, n), (n, 3))
     before = left.copy(), right.copy()
-    same(small.solve(left, right), np.linalg.solve(left, right))
-    assert np.array_equal(left, before[0])
-    assert np.array_equal(right, before[1])
     wide = np.concatenate([left, np.zeros((n, 2))], axis=1)
     small.solve_inplace(wide, right, n)
     same(right, np.linalg.solve(*before))
 
 
 def test_a_singular_matrix_has_no_solution():
-    assert np.isnan(small.solve(np.ones((2, 2)), np.eye(2))).all()
+    out = np.eye(2)
+    small.solve_inplace(np.ones((2, 2)), out, 2)
+    assert np.isnan(out).all()
 
 
 def test_copies():

@@ -6,17 +6,18 @@ filter's gain L ``Phi(g, s) L(s) = X(g)^-T Y(s)^T H' R^-1``. Both are entire fun
 eight Gauss-Legendre nodes integrate to machine precision over steps of |M| g <= 1/2.
 
 Covariances are passed as roots ``P = S S'``, since ``(I + P G)^-1`` loses all digits if the
-eigenvalues of P differ by orders of magnitude.
+eigenvalues of P differ by orders of magnitude. Roots are updated by orthogonal triangularisation
+(Kailath, Sayed and Hassibi 2000, Linear Estimation, chapter 12), in which no subtraction cancels
+digits. An error is a linear form of independent standard normal inputs, its coefficients (n, C).
 """
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from netkf.linalg.arrays import FloatArray, as_kernel_array
-from netkf.theory.numerics.roots import flow_estimates
+from netkf.algorithms.kernels.riccati import exponential_series, hamiltonian
+from netkf.algorithms.kernels.square_root import lower_triangular
+from netkf.linalg.arrays import FloatArray, block_diagonal
 
 # Eight nodes integrate e^{A s} to rounding within one unit; mapped from [-1, 1] to [0, 1].
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
@@ -27,22 +28,16 @@ MAX_NORM, TERMS = 0.5, 22  # largest |M| s, and terms, of exp(M s); the remainde
 class ShortExponential:
     """``exp(M s)`` (d, d) by its Taylor series for 0 <= s <= ``unit`` seconds, at which |M| s =
     MAX_NORM in the 1-norm, for M (d, d) per second.
-
-    terms : (TERMS, d, d) coefficients of the powers of s / unit
     """
 
     def __init__(self, M: FloatArray) -> None:
-        """Compute the terms (TERMS, d, d) of the series of exp(M s) for M (d, d), per second."""
         self.unit = MAX_NORM / max(float(np.abs(M).sum(axis=0).max(initial=0.0)), 1e-300)
-        terms = [np.eye(len(M))]
-        for k in range(1, TERMS):
-            terms.append(terms[-1] @ (M * self.unit) / k)
-        self.terms = np.array(terms)
+        self._terms = exponential_series(M * self.unit, TERMS)
 
     def __call__(self, times: FloatArray) -> FloatArray:
         """Return exp(M s) (K, d, d) at K ``times`` s in seconds, each at most ``unit``."""
         powers = (np.asarray(times)[:, None] / self.unit) ** np.arange(TERMS)
-        return np.asarray(np.tensordot(powers, self.terms, 1))
+        return np.asarray(np.tensordot(powers, self._terms, 1))
 
 
 class ErrorFlow:
@@ -63,26 +58,60 @@ class ErrorFlow:
         """Take A (n, n), B (n, m), H (p, n) and R (p, p) as the filters assume them, a root
         ``noise`` (p, p) of the true R, and the true B of the ``plant``; A is the true one.
         """
-        root_R = np.linalg.cholesky(R)
-        whitened, weight = np.linalg.solve(root_R, H), np.linalg.solve(R, H).T
+        root_R, weight = np.linalg.cholesky(R), np.linalg.solve(R, H).T
+        self._H = np.linalg.solve(root_R, H)
+        # What enters errors by X' and Y': noises as filters assume them, and true ones.
+        self._assumed = block_diagonal([B, weight @ root_R])
+        self._true, self._m = block_diagonal([plant, weight @ noise]), plant.shape[1]
         # The Hamiltonian of dP = A P + P A' + Q - P G P, scaled to balance its off-diagonal blocks.
-        G, Q = whitened.T @ whitened, B @ B.T
-        scale = _balancing_scale(A, Q, G)
-        exponential = ShortExponential(np.block([[-A.T, G * scale], [Q / scale, A]]))
-        self.unit = exponential.unit
-        tables = (whitened, weight @ root_R, weight @ noise, B, plant)
-        self._tables = tuple(as_kernel_array(table) for table in tables)
-        self._exponential = (exponential.terms, exponential.unit, scale)
+        M, self._scale = hamiltonian(A, B @ B.T, self._H.T @ self._H)
+        self._exponential = ShortExponential(M)
+        self.unit = self._exponential.unit
 
     def move(
         self, errors: FloatArray, roots: FloatArray, gap: float, columns: tuple[int, int]
     ) -> None:
-        """Propagate the forms of K ``errors`` (K, n, C) and the ``roots`` (K, n, n) of their P in
-        place over ``gap`` seconds, at most ``unit``; ``columns``: the first of the plant's 8 m
-        inputs, and the first of n inputs of each error.
+        """Propagate the forms of K ``errors`` (K, n, C) and the lower triangular ``roots``
+        (K, n, n) of their P in place over ``gap`` seconds, at most ``unit``; ``columns``: the first
+        of the plant's 8 m inputs, and the first of n inputs of each error.
         """
-        quadrature = (NODES, WEIGHTS)
-        flow_estimates(errors, roots, columns, self._tables, self._exponential, gap, quadrature)
+        n, weights = errors.shape[1], np.sqrt(WEIGHTS * gap)[:, None, None]
+        # At the nodes [X', Y'] = upper + P lower, and at the end of the gap.
+        E = self._exponential(np.append(NODES, 1.0) * gap).swapaxes(1, 2).copy()
+        E[:, :n, n:] *= self._scale
+        E[:, n:, :n] /= self._scale
+        upper, lower, inverse = E[:-1, :n], E[:-1, n:], np.linalg.inv(E[:, :n, :n])
+        # From P = 0: F = X(g)^-T, the information Gamma' Gamma of readings, and a root of P(g).
+        F, Gamma = inverse[-1], (weights * (self._H @ inverse[:-1])).reshape(-1, n)
+        start = _narrowed(_side_by_side(weights * (F @ upper @ self._assumed)))
+        # L L' = I + S' G S, so that J = (I + P G)^-1 = I - S (L L')^-1 S' G and S L^-T is a root of
+        # J P.
+        SG = np.swapaxes(Gamma @ roots, 1, 2)
+        eye = np.broadcast_to(np.eye(n), roots.shape)
+        L = lower_triangular(np.concatenate([eye, SG], axis=2))
+        solved = np.linalg.solve(L, np.concatenate([np.swapaxes(roots, 1, 2), SG], axis=2))
+        FSL = F @ np.swapaxes(solved[..., :n], 1, 2)
+        FJ, FJP = F - FSL @ solved[..., n:] @ Gamma, FSL @ solved[..., :n]
+        beginnings = np.broadcast_to(start, (len(roots), *start.shape))
+        roots[...] = lower_triangular(np.concatenate([FSL, beginnings], axis=2))
+        errors[...] = FJ @ errors
+        noises = weights * ((FJ[:, None] @ upper + FJP[:, None] @ lower) @ self._true)
+        moved = _side_by_side(noises[..., : self._m])
+        errors[:, :, columns[0] : columns[0] + moved.shape[2]] += moved
+        for e, own in enumerate(_narrowed(_side_by_side(noises[..., self._m :]))):
+            first = columns[1] + e * n
+            errors[e, :, first : first + own.shape[1]] += own
+
+
+def _side_by_side(parts: FloatArray) -> FloatArray:
+    """Return the matrices (..., n, 8 m) of 8 ``parts`` (..., 8, n, m) each."""
+    moved = np.swapaxes(parts, -3, -2)
+    return moved.reshape(*moved.shape[:-2], -1)
+
+
+def _narrowed(factor: FloatArray) -> FloatArray:
+    """Return matrices with the products of ``factor`` (..., n, c), of at most n columns."""
+    return factor if factor.shape[-1] <= factor.shape[-2] else lower_triangular(factor)
 
 
 class StateFlow:
@@ -100,16 +129,4 @@ class StateFlow:
         """Return transition (n, n) and response (n, 8 m) to inputs over a short ``gap`` (s)."""
         E = self._exp(np.append((1.0 - NODES) * gap, gap))
         root_weights = np.sqrt(WEIGHTS * gap)[:, None, None]
-        responses = root_weights * (E[:-1] @ self._B)
-        return E[-1], responses.transpose(1, 0, 2).reshape(len(self._B), -1)
-
-
-def _balancing_scale(A: FloatArray, Q: FloatArray, G: FloatArray) -> float:
-    """Return the scale for which the Hamiltonian's blocks Q and G have equal norms."""
-    q, g = float(np.abs(Q).max(initial=0.0)), float(np.abs(G).max(initial=0.0))
-    # Equal blocks Q / c and G c need c = sqrt(q / g). Without G, c = q makes Q / c of size 1;
-    # without Q, c makes G c as large as A.
-    if g == 0.0:
-        return q or 1.0
-    rate = max(float(np.abs(A).max(initial=0.0)), 1e-12)
-    return math.sqrt(q / g) if q > 0.0 else rate / g
+        return E[-1], _side_by_side(root_weights * (E[:-1] @ self._B))
