@@ -23,8 +23,6 @@ from netkf.runs.stored import StoredRun
 from netkf.runs.summary import CONFIDENCE
 from netkf.runs.tables import format_number, format_with_error
 from netkf.studies.compare import Comparison, Entry, quantity_label
-from netkf.studies.compare_filters import ComparedFilter
-from netkf.studies.filter_values import Quantity
 from netkf.studies.stored import StoredComparison
 from netkf.theory.common.papers import PAPERS
 from netkf.trace.messages import DELIVERED, LATE, LOST
@@ -422,17 +420,17 @@ def _describe_sweep(source: ReportSource) -> list[str]:
 
 
 def _describe_filters(comparison: StoredComparison) -> list[str]:
-    rows = [row for row in comparison.rows if row.ran and math.isfinite(_rms_error(row).value)]
+    rows = [row for row in comparison.rows if row.ran and math.isfinite(row.rms_error.value)]
     if not rows:
         return ["No filter has a finite RMS error"]
-    best = min(rows, key=lambda row: _rms_error(row).value)
-    listed = ", ".join(f"{row.filter} {format_number(_rms_error(row).value)}" for row in rows)
+    best = min(rows, key=lambda row: row.rms_error.value)
+    listed = ", ".join(f"{row.filter} {format_number(row.rms_error.value)}" for row in rows)
     sentences = [
         f"Of {len(rows)} filters over {comparison.runs:,} runs of each, {best.filter} had the "
         f"smallest RMS error ({listed})"
     ]
     for row in rows:
-        error = _rms_error(row)
+        error = row.rms_error
         if error.real:
             side = "less" if error.difference < 0.0 else "more"
             sentences.append(
@@ -452,10 +450,6 @@ def _describe_filters(comparison: StoredComparison) -> list[str]:
         sentences.append(f"P does not describe the errors of {', '.join(inconsistent)}")
     incomplete = [row for row in comparison.rows if row.status != "complete"]
     return sentences + [f"{row.filter}: {row.status}" for row in incomplete]
-
-
-def _rms_error(row: ComparedFilter) -> Quantity:
-    return row.rms_error
 
 
 def _format_time(seconds: float) -> str:

@@ -11,7 +11,6 @@ import numpy as np
 from scipy.special import stdtrit
 
 from netkf.core.printable import shorten
-from netkf.linalg.arrays import FloatArray
 from netkf.report.directories import ReportSource
 from netkf.report.markup import bullets, paragraph, table_box
 from netkf.report.replicas import spread_curves
@@ -104,8 +103,8 @@ def _bound_notes(source: ReportSource) -> list[str]:
     if promised is not None:
         label = promised.limit_label
         limits = {label: summary["limit"], "centralised filter": summary["central"]}
-        traces = [f"{name} {format_number(value)}" for name, value in limits.items() if value]
-        notes += [f"traces to compare: {', '.join(traces)}"] if traces else []
+        known = [f"{name} {format_number(value)}" for name, value in limits.items() if value]
+        notes += [f"traces to compare: {', '.join(known)}"] if known else []
         if summary["limit"]:
             weights = "1/N" if label.startswith("limit S") else "their weights"
             notes.append(
@@ -242,8 +241,8 @@ def ensemble_curves(source: ReportSource) -> dict[str, Any] | None:
     if ensemble is None:
         return None
     # The standard error of a trace is at most the sum of the standard errors of the diagonal.
-    trace, trace_se = _matrix_traces(ensemble.mean_P), _matrix_traces(ensemble.se_P)
-    square, square_se = _matrix_traces(ensemble.mean_error), _matrix_traces(ensemble.se_error)
+    trace, trace_se = traces(ensemble.mean_P), traces(ensemble.se_P)
+    square, square_se = traces(ensemble.mean_error), traces(ensemble.se_error)
     nodes: dict[str, Any] = {}
     sizes = source.scenario.sizes.tolist()
     for k, node in enumerate(ensemble.nodes):
@@ -270,9 +269,9 @@ def difference_curves(source_a: ReportSource, source_b: ReportSource) -> dict[st
     freedom = min(source_a.runs, source_b.runs) - 1
     if not np.array_equal(first.times, second.times) or freedom < 1:
         return None
-    difference = _matrix_traces(second.mean_error) - _matrix_traces(first.mean_error)
+    difference = traces(second.mean_error) - traces(first.mean_error)
     # The standard error of a trace is at most the sum of the standard errors of the diagonal.
-    error = np.hypot(_matrix_traces(first.se_error), _matrix_traces(second.se_error))
+    error = np.hypot(traces(first.se_error), traces(second.se_error))
     level = (1.0 - CONFIDENCE) / (2.0 * difference.size)
     half_width = float(stdtrit(freedom, 1.0 - level)) * error
     curves = (difference, difference - half_width, difference + half_width)
@@ -281,10 +280,6 @@ def difference_curves(source_a: ReportSource, source_b: ReportSource) -> dict[st
         for k, node in enumerate(first.nodes)
     }
     return {"confidence": CONFIDENCE, "times": first.times.tolist(), "nodes": nodes}
-
-
-def _matrix_traces(matrices: FloatArray) -> FloatArray:
-    return traces(matrices)
 
 
 def averages(source: ReportSource) -> list[dict[str, Any]] | None:

@@ -23,6 +23,7 @@ from netkf.theory.common.plant_assumptions import (
     connected_row,
     judge_driven,
     judge_observed,
+    model_and_start_rows,
     slot_plant_rows,
     start_rows,
 )
@@ -68,13 +69,16 @@ def assumption_rows(scenario: Scenario) -> list[AssumptionRow]:
     nonlinear = [*life_rows(scenario), *nonlinear_rows(scenario)]
     if not scenario.plant.linear:
         return [*nonlinear, *start_rows(scenario, ANY)]
-    paper_rows = theory_of(scenario).slot_rows
+    paper = theory_of(scenario)
     if not scenario.slotted:
         rows = _clock_rows(scenario)
-    elif paper_rows is None:
-        rows = [*slot_plant_rows(scenario), *start_rows(scenario, "G (10)")]
+    elif paper.slot_rows is not None:
+        rows = paper.slot_rows(scenario)
+    elif paper.slot_conditions is not None:
+        conditions = paper.slot_conditions(scenario)
+        rows = model_and_start_rows(scenario, conditions[0][1], *conditions)
     else:
-        rows = paper_rows(scenario)
+        rows = [*slot_plant_rows(scenario), *start_rows(scenario, "G (10)")]
     return [*nonlinear, *rows]
 
 

@@ -36,6 +36,7 @@ class PaperTheory:
     """What a paper's folder states about a scenario with one of its filters; None: nothing.
 
     slot_rows : assumptions in slots, as rows of the table; None: those of any filter
+    slot_conditions : those beside the model and the start of filters, where there are no others
     weight_rows : assumptions on weights under clocks
     error_columns : exact errors of a run, of a filter that is not affine
     slot_jumps, clock_jumps : errors in slots and under clocks as a linear system with jumps, of a
@@ -46,6 +47,7 @@ class PaperTheory:
     """
 
     slot_rows: Rows | None = None
+    slot_conditions: Rows | None = None
     weight_rows: Rows | None = None
     error_columns: Callable[[Scenario, Run], ErrorColumns] | None = None
     slot_jumps: Callable[[Scenario], LinearErrors] | None = None
@@ -68,10 +70,6 @@ def _tree_rows(scenario: Scenario) -> list[AssumptionRow]:
     return [("the graph has no loops", "Weiss and Freeman 2001", tree, evidence)]
 
 
-def _belief_rows(scenario: Scenario) -> list[AssumptionRow]:
-    return model_and_start_rows(scenario, "Weiss and Freeman 2001", *_tree_rows(scenario))
-
-
 def _pair_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return the row under which kept cross-covariances are those of the errors."""
     pairs = max(scenario.topology.degrees.values()) < 2
@@ -81,20 +79,14 @@ def _pair_rows(scenario: Scenario) -> list[AssumptionRow]:
     return [("no node has two neighbours", "Luft et al. 2018", pairs, evidence)]
 
 
-def _cross_covariance_rows(scenario: Scenario) -> list[AssumptionRow]:
-    return model_and_start_rows(scenario, "Luft et al. 2018", *_pair_rows(scenario))
-
-
 def _pseudo_state_rows(scenario: Scenario) -> list[AssumptionRow]:
     source, otherwise = "Das and Moura 2017", "gains are those without losses"
-    row = _no_loss(scenario, source, "every message arrives in its slot", otherwise)
-    return model_and_start_rows(scenario, source, row)
+    return [_no_loss(scenario, source, "every message arrives in its slot", otherwise)]
 
 
 def _event_rows(scenario: Scenario) -> list[AssumptionRow]:
     source, otherwise = "Battistelli et al. 2018", "a sender does not notice a loss"
-    row = _no_loss(scenario, source, "neighbours have what was sent", otherwise)
-    return model_and_start_rows(scenario, source, row)
+    return [_no_loss(scenario, source, "neighbours have what was sent", otherwise)]
 
 
 def _track_rows(scenario: Scenario) -> list[AssumptionRow]:
@@ -113,12 +105,10 @@ def _silence_rows(scenario: Scenario) -> list[AssumptionRow]:
     start = "with the same mean and covariance"
     if not alike:
         start = "silence is about the sender's prediction, which is not the hearer's"
-    return model_and_start_rows(
-        scenario,
-        source,
+    return [
         ("every node hears every other, without losses", source, heard, evidence),
         ("all filters have one estimate from the start", source, alike, start),
-    )
+    ]
 
 
 def _reset_rows(scenario: Scenario) -> list[AssumptionRow]:
@@ -132,21 +122,21 @@ def _reset_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 OF_PAPERS = {
-    "belief_propagation": PaperTheory(_belief_rows, _tree_rows),
-    "block_cross_covariances": PaperTheory(_cross_covariance_rows, _pair_rows),
-    "consensus_innovations": PaperTheory(_pseudo_state_rows),
+    "belief_propagation": PaperTheory(slot_conditions=_tree_rows, weight_rows=_tree_rows),
+    "block_cross_covariances": PaperTheory(slot_conditions=_pair_rows, weight_rows=_pair_rows),
+    "consensus_innovations": PaperTheory(slot_conditions=_pseudo_state_rows),
     "constant_gain": PaperTheory(
         slot_jumps=constant_gains.slot_jumps, clock_jumps=constant_gains.clock_jumps
     ),
     "diffusion": PaperTheory(diffusion.slot_rows),
-    "event_triggered": PaperTheory(_event_rows),
+    "event_triggered": PaperTheory(slot_conditions=_event_rows),
     "gossip": PaperTheory(gossip.slot_rows),
     "hybrid": PaperTheory(weight_rows=_reset_rows),
     "information_consensus": PaperTheory(information_consensus.slot_rows),
     "intermittent": PaperTheory(intermittent.slot_rows),
     "kalman_consensus": PaperTheory(slot_jumps=kalman_consensus.slot_jumps),
     "push_sum": PaperTheory(push_sum.slot_rows, slot_promises=slot_promises, slot_lines=slot_lines),
-    "stochastic_trigger": PaperTheory(_silence_rows, error_columns=error_columns),
+    "stochastic_trigger": PaperTheory(slot_conditions=_silence_rows, error_columns=error_columns),
     "track_fusion": PaperTheory(_track_rows, steady_slots=tracks_in_slots),
 }
 

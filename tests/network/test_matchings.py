@@ -10,7 +10,7 @@ import netkf
 from netkf import theory
 from netkf.network.graphs import Cycle, Edges
 from netkf.network.matchings import Matching, maximal_matchings
-from netkf.theory.gossip.matchings import primitive
+from netkf.theory.gossip.matchings import period_of
 from tests.cases import FOLDER
 from tests.conftest import SCENARIOS
 
@@ -30,7 +30,7 @@ def test_exact_means_and_draws(case):
     protocol = matching(case["protocol"])
     mean = protocol.mean(topology)
     np.testing.assert_allclose(mean, case["Abar"], rtol=0, atol=1e-15)
-    assert primitive(mean)[1] == case["primitive"]
+    assert (period_of(mean) == 1) == case["primitive"]
     random, draws, seen = np.random.default_rng(1), 4000, np.zeros_like(mean)
     for _ in range(draws):
         pairs = protocol.draw(topology, random)

@@ -12,7 +12,7 @@ from netkf.theory.gossip.matchings import (
     detecting_walk,
     effective_matching,
     mean_matching,
-    primitive,
+    period_of,
 )
 
 MAX_LISTED = 12  # matchings that a row names
@@ -36,17 +36,17 @@ def _matching_rows(scenario: Scenario) -> list[AssumptionRow]:
     except TheoryError as error:
         return [(name, "G C.1", None, f"not decided: {error}")]
     # Irreducible and aperiodic together mean that some power of the matrix is positive (C.1).
-    irreducible, aperiodic, period = primitive(mean)
-    if not irreducible:
+    period = period_of(mean)
+    if not period:
         evidence = "some nodes are never reached from others"
-    elif not aperiodic:
+    elif period > 1:
         evidence = (
             f"it has period {period}: tokens visit the two halves of the network in turn, and "
             "filters can blow up though every sensor is observable"
         )
     else:
         evidence = f"least positive entry {mean[mean > 0.0].min():.3g}"
-    return [(name, "G C.1", irreducible and aperiodic, evidence)]
+    return [(name, "G C.1", period == 1, evidence)]
 
 
 def _mean_swaps(scenario: Scenario) -> FloatArray:

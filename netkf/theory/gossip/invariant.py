@@ -11,7 +11,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, IntArray, square_root
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
-from netkf.theory.gossip.matchings import effective_matching, primitive
+from netkf.theory.gossip.matchings import effective_matching, period_of
 from netkf.theory.intermittent.riccati import couple_from_the_past
 from netkf.theory.numerics.matrices import as_integer
 
@@ -44,7 +44,7 @@ def switched_samples(scenario: Scenario, samples: int, seed: int) -> SwitchedSam
     Abar is not known or not irreducible, or if the recursion does not forget its start.
     """
     matching = effective_matching(scenario)
-    if not primitive(matching)[0]:
+    if not period_of(matching):
         raise TheoryError("G C.1 fails: Abar is not irreducible, so that nodes have different laws")
     samples, seed = as_integer("samples", samples, 1), as_integer("seed", seed, 0)
     F, Q = scenario.slot_belief

@@ -72,20 +72,20 @@ def _recorded_mean(scenario: Scenario, activation: RecordedSlots) -> FloatArray:
     return mean
 
 
-def primitive(matrix: FloatArray) -> tuple[bool, bool, int]:
-    """Return (irreducible, also aperiodic, period) of a nonnegative ``matrix``; 0 if reducible."""
+def period_of(matrix: FloatArray) -> int:
+    """Return the period of a nonnegative ``matrix``, 1 if it is aperiodic; 0 if it is reducible."""
     import networkx
 
     graph = networkx.from_numpy_array((matrix > 1e-15).astype(int), create_using=networkx.DiGraph)
     if not networkx.is_strongly_connected(graph):
-        return False, False, 0
+        return 0
     # With d(i) the distance of i from node 0, the length of a cycle is the sum of
     # d(i) + 1 - d(j) over its edges (i, j): the gcd of these terms is the period.
     levels = networkx.single_source_shortest_path_length(graph, 0)
     period = 0
     for i, j in graph.edges:
         period = int(np.gcd(period, levels[i] + 1 - levels[j]))
-    return True, period == 1, period
+    return period
 
 
 def detecting_walk(scenario: Scenario) -> list[int] | None:

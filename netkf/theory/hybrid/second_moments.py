@@ -51,14 +51,11 @@ def second_moment_rate(scenario: Scenario) -> float:
         other = Y @ np.swapaxes(system.flows, 1, 2)
         return np.asarray(half + other + system.inflow(Y)).reshape(-1)
 
-    # Arnoldi's method needs at least three rows.
-    if size == 1:
-        return float(equation(np.ones(1))[0])
     operator = scipy.sparse.linalg.LinearOperator((size**2, size**2), equation, dtype=float)
     # The equation preserves positive semidefinite Y: start inside that cone.
     start = np.tile(np.eye(n).reshape(-1), nodes)
     first = np.outer(start, start).reshape(-1)
-    if size < 3:
+    if size < 3:  # too few rows for Arnoldi's method
         dense = np.stack([equation(column) for column in np.eye(size**2)], axis=1)
         return float(np.linalg.eigvals(dense).real.max())
     try:

@@ -9,7 +9,6 @@ weight, omega a_ij <= 1 (derived; at omega = N that needs all a_ij = 1/N).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -32,44 +31,29 @@ def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _judge_counts(scenario: Scenario) -> tuple[bool, str]:
-    weights, delay = step_weights(scenario), scenario.network.channel.delay.fixed
-    steps = scenario.node_filter.timing.steps(0)
-    # A node that hears nothing counts its own reading in full, whatever the weights.
-    _, silent = effective_weights(scenario, [])
+    steps, delay = scenario.node_filter.timing.steps(0), scenario.network.channel.delay.fixed
     # Each of the steps has its share of the phase; at the end of it a message may be late.
     in_time = delay is not None and (delay == 0.0 or steps * delay < scenario.phase_length)
     lossless = in_time and nothing_is_lost(scenario)
+    # A node that hears nothing counts its own reading in full, whatever the weights.
+    max_count = float(reading_counts(scenario, steps if lossless else 0).max())
+    evidence = f"a node counts a reading up to {max_count:.4g} times"
     if not lossless:
-        max_count = float(silent.max())
-        evidence = f"a node counts a reading up to {max_count:.4g} times: its own, in slots in "
-        return max_count <= 1.0 + TOLERANCE, f"{evidence}which it hears nothing"
-    _, counts = effective_weights(scenario, [weights] * steps)
-    max_count = float(np.max(counts))
-    return max_count <= 1.0 + TOLERANCE, f"a node counts a reading up to {max_count:.4g} times"
+        evidence += ": its own, in slots in which it hears nothing"
+    return max_count <= 1.0 + TOLERANCE, evidence
 
 
-def step_weights(scenario: Scenario) -> FloatArray:
-    """Return the weights (N, N) that nodes (rows) give to the messages of others (columns)."""
-    index = scenario.topology.index
-    weights = np.zeros((len(index), len(index)))
-    for sender, receiver in scenario.topology.directions:
-        weights[index[receiver], index[sender]] = scenario.weight(receiver, sender)
-    return weights
-
-
-def effective_weights(
-    scenario: Scenario, weights: Sequence[FloatArray]
-) -> tuple[FloatArray, FloatArray]:
-    """Return how often i counts prediction and reading of j, (N, N) each, by ``weights``."""
+def reading_counts(scenario: Scenario, steps: int) -> FloatArray:
+    """Return how often i counts the reading of j, (N, N), after so many steps without a loss."""
     algorithm: Any = scenario.node_filter
-    N = len(scenario.nodes)
-    mixing = np.eye(N)
-    for heard in weights:
-        # A node gives the weight of lost messages to its own pair.
-        mixing = (heard + np.diag(np.maximum(1.0 - heard.sum(axis=1), 0.0))) @ mixing
+    index, N = scenario.topology.index, len(scenario.nodes)
+    heard = np.zeros((N, N))
+    for sender, receiver in scenario.topology.directions:
+        heard[index[receiver], index[sender]] = scenario.weight(receiver, sender)
+    # A node gives the rest of its weight to its own pair.
+    mixing = heard + np.diag(np.maximum(1.0 - heard.sum(axis=1), 0.0))
     # A node averages K pairs, each a multiple (``shares``) of the information of its prediction and
     # of its reading. The estimate is the sum of these pairs and of the node's own prediction, each
     # times its entry of ``counts``.
     shares, counts = algorithm.recipe(N)
-    times = counts[:-1] @ shares
-    return times[0] * mixing + counts[-1] * np.eye(N), times[1] * mixing
+    return np.asarray((counts[:-1] @ shares)[1] * np.linalg.matrix_power(mixing, steps))
