@@ -47,13 +47,11 @@ def test_unknown_consistency_is_no_inconsistency():
     def row(name, consistency):
         rms = SimpleNamespace(value=1.0, real=False)
         return SimpleNamespace(
-            filter=name, ran=True, status="complete", consistency=consistency, values={"rms": rms}
+            filter=name, ran=True, status="complete", consistency=consistency, rms_error=rms
         )
 
     rows = [row("a", "consistent"), row("b", "-"), row("c", "overconfident")]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(claims, "_rms_error", lambda row: row.values["rms"])
-        sentences = claims._describe_filters(SimpleNamespace(rows=rows, runs=1, first="a"))
+    sentences = claims._describe_filters(SimpleNamespace(rows=rows, runs=1, first="a"))
     assert "P does not describe the errors of c (overconfident)" in sentences
 
 
