@@ -9,6 +9,7 @@ from netkf.cli.options import (
     load_scenario,
     pool_settings,
     print_json,
+    print_notes,
     print_table_notes,
     print_title,
 )
@@ -39,6 +40,7 @@ def _compare(options: argparse.Namespace) -> int:
             progress=line.make_count_update("filters"),
         )
     print_table_notes(scenario)
+    print_notes([f"{row.filter}: {row.status}" for row in comparison.rows if not row.ran])
     try:
         if options.out is not None:
             written = write_comparison(scenario, comparison, options.out)

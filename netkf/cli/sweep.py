@@ -7,7 +7,13 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from netkf.cli import pictures
-from netkf.cli.options import load_scenario, print_json, print_table_notes, print_title
+from netkf.cli.options import (
+    load_scenario,
+    parse_changes,
+    print_json,
+    print_table_notes,
+    print_title,
+)
 from netkf.cli.progress import ProgressLine
 from netkf.core.printable import count_phrase
 
@@ -22,7 +28,8 @@ def _run(options: argparse.Namespace) -> int:
     from netkf.studies.parameter_grid import parse_grid
     from netkf.studies.sweep import plan_sweep, sweep_to_directory
 
-    grid, scenario = parse_grid(options.vary), load_scenario(options)
+    fixed = [*parse_changes(options.set), *(["seed"] if options.seed is not None else [])]
+    grid, scenario = parse_grid(options.vary, fixed), load_scenario(options)
     draw = partial(pictures.draw_picture, pictures.SWEEP, scenario.name)
     completed: list[CompletedSweep] = []
     try:

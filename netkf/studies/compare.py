@@ -201,7 +201,8 @@ def read_directory(directory: Path) -> RunDirectory:
         with add_file_name("manifest.json"):
             manifest = read_document(directory / "manifest.json")
             require_form(manifest, MANIFEST_FORM)
-        if manifest["status"] not in FINAL_STATUSES:
+        # That of a sweep has no summary.
+        if manifest["status"] not in FINAL_STATUSES and "vary" not in manifest:
             rule = f"holds a run that did not finish ({shorten(manifest['status'], 30)})"
             raise ScenarioError(where, rule, None, "finish it with netkf run --resume")
         read_checked_document(directory, "manifest.json", MANIFEST_FORM)  # its seal

@@ -5,7 +5,8 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import date
 from datetime import time as clock_time
 from typing import Any, NamedTuple
@@ -24,8 +25,10 @@ MAX_INTEGER = 2**63
 _RANGE = re.compile(r"^([^:,\[{\"']+):([^:,]+):(\d+)$")
 
 
-def parse_grid(settings: Sequence[str]) -> dict[str, list[Any]]:
-    """Return the values of ``key.path=v1,v2,...`` or ``start:stop:count``; raises ScenarioError."""
+def parse_grid(settings: Sequence[str], fixed: Iterable[str] = ()) -> dict[str, list[Any]]:
+    """Return the values of ``key.path=v1,v2,...`` or ``start:stop:count``; raises ScenarioError,
+    also where they replace one of the keys that ``--set`` has ``fixed``.
+    """
     grid: dict[str, list[Any]] = {}
     for setting in settings:
         key, text = split_setting("--vary", setting)
@@ -35,7 +38,19 @@ def parse_grid(settings: Sequence[str]) -> dict[str, list[Any]]:
         grid[key] = (
             _even_values(key, *evenly.groups()) if evenly else parse_values("--vary", key, text)
         )
+    for key, other in itertools.product(grid, fixed):
+        if _replaces(key, other):
+            rule = f"{key} replaces what --set or --seed gives for {other}"
+            raise ScenarioError("--vary", rule, None, "leave out one of the two")
     return grid
+
+
+def _path(key: str) -> list[str]:
+    return key.replace("[", ".").replace("]", "").split(".")
+
+
+def _replaces(key: str, earlier: str) -> bool:
+    return _path(earlier)[: len(_path(key))] == _path(key)
 
 
 def _even_values(key: str, start: str, stop: str, count: str) -> list[Any]:
@@ -73,7 +88,11 @@ def check_grid(grid: Any) -> dict[str, list[Any]]:
         if not listed:
             raise ScenarioError("--vary", f"{key} needs a list of values", values, "give some")
         plain = values.tolist() if isinstance(values, np.ndarray) else list(values)
-        values_by_key[str(key)] = list(map(_storable, plain))
+        values_by_key[str(key)] = stored = list(map(_storable, plain))
+        for value, count in Counter(map(_text, stored)).items():
+            if count > 1:
+                rule = f"{key} has one value {count} times"
+                raise ScenarioError("--vary", rule, value, "give each once; --runs repeats runs")
     _require_apart(list(values_by_key))
     size = math.prod(map(len, values_by_key.values()))
     if size > MAX_POINTS:
@@ -89,13 +108,22 @@ def _storable(value: Any) -> Any:
     return value.isoformat() if isinstance(value, (date, clock_time)) else value
 
 
+def _text(value: Any) -> str:
+    """Return a value as TOML; of equal numbers one text."""
+    is_integer = isinstance(value, int) and not isinstance(value, bool)
+    return toml_text(float(value) if is_integer and abs(value) < 2**53 else value)
+
+
 def _require_apart(keys: list[str]) -> None:
     """Raise ScenarioError if a key sets again what an earlier one has varied."""
-    paths = [key.replace("[", ".").replace("]", "").split(".") for key in keys]
-    for (first, path), (key, later) in itertools.combinations(zip(keys, paths, strict=True), 2):
-        if path[: len(later)] == later:
+    for first, key in itertools.combinations(keys, 2):
+        if _replaces(key, first):
             rule = f"{key} replaces the values of {first}, which is varied before it"
-            remedy = "vary the table first" if path != later else "give all values in one list"
+            remedy = (
+                "vary the table first"
+                if not _replaces(first, key)
+                else "give all values in one list"
+            )
             raise ScenarioError("--vary", rule, None, remedy)
 
 
@@ -156,7 +184,7 @@ def is_integer_key(scenario: Scenario, key: str) -> bool:
     """Return True if ``key`` has an integer value; raises ScenarioError for no number."""
     value: Any = resolve_defaults(scenario)
     # Follow the path, such as sensors[0].R, through tables and lists.
-    for name in key.replace("[", ".").replace("]", "").split("."):
+    for name in _path(key):
         try:
             value = value[int(name)] if isinstance(value, (list, tuple)) else value[name]
         except (KeyError, IndexError, ValueError, TypeError):

@@ -194,7 +194,8 @@ def test_the_command_line_prints_a_table_a_document_and_a_directory(file, tmp_pa
     command = ["compare-filters", str(file), "--filters", filters, "--runs", "3", "--workers", "1"]
     out = tmp_path / "out"
     assert main([*command, "--out", str(out)]) == 0
-    text = capsys.readouterr().out
+    text, notes = capsys.readouterr()
+    assert "note: gossip: cannot run here: " in notes
     for words in (
         "icf steps=2",
         "gossip: cannot run here",

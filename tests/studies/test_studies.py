@@ -91,6 +91,15 @@ def test_grids_are_lists_ranges_tables_and_words():
     [
         (["sweep", RING, "--vary", "rate"], "--vary: must be KEY.PATH=VALUE"),
         (["sweep", RING, "--vary", f"{RATE}=1,2", "--vary", f"{RATE}=3"], "is varied twice"),
+        (["sweep", RING, "--vary", f"{RATE}=1,2,1.0"], f"{RATE} has one value 2 times; got '1.0'"),
+        (
+            ["sweep", RING, "--set", f"{RATE}=1", "--vary", f"{RATE}=1,2"],
+            f"{RATE} replaces what --set or --seed gives for {RATE}",
+        ),
+        (
+            ["sweep", RING, "--seed", "1", "--vary", "seed=1,2"],
+            "seed replaces what --set or --seed",
+        ),
         (["sweep", RING, "--vary", f"{RATE}=1,-2"], f"at {RATE} = -2: {RATE}: must be a finite"),
         (["sweep", RING, "--vary", "network.activation.rat=1"], "is not a key here"),
         (
