@@ -205,3 +205,19 @@ def test_rates_are_balanced_in_all_units_of_time_or_in_none(unit):
     assert not coupled._is_symmetric(c)
     assert coupled._is_symmetric(c + c.T * (1.0 + 1e-13))
     np.testing.assert_allclose(coupled._stationary(c), [0.75, 0.25])
+
+
+@pytest.mark.parametrize("seed", range(1, 4))
+def test_a_driven_mode_that_nobody_sees_has_no_steady_state(build, seed):
+    """Its covariance grows as t, so slowly that gains of a late time looked stabilising."""
+    random = np.random.default_rng(seed)
+    H, B = (random.normal(size=shape).round(2).tolist() for shape in ((1, 3), (3, 2)))
+    plant = {"kind": "diffusion", "A": [[0.0] * 3] * 3, "B": B, "cov": np.eye(3).tolist()}
+    clock = {"kind": "poisson", "rate": 20.0}
+    scenario = build(
+        plant=plant,
+        sensors=[{"nodes": [0], "H": H, "R": [[0.05]]}],
+        network={"graph": {"kind": "complete", "nodes": 3}, "activation": clock},
+    )
+    with pytest.raises(netkf.TheoryError, match="faster links do not give it one"):
+        netkf.theory.steady_covariance_bound(scenario)

@@ -28,6 +28,7 @@ from netkf.theory.hybrid.dense import FullMatrix
 from netkf.theory.hybrid.linearised import is_stable, solve_map
 from netkf.theory.hybrid.packed import PackedRiccati
 from netkf.theory.hybrid.samples import transmits_at_samples
+from netkf.theory.numerics.matrices import undetectable_mode
 
 MAX_GROWTH = 1e9  # of P relative to its start, beyond which it is taken to grow without bound
 RESIDUAL = 1e-9  # of H(12), relative to its terms: a fixed point up to rounding
@@ -137,6 +138,12 @@ def _newton(packed: PackedRiccati, P: FloatArray) -> FloatArray:
 def _find_stabilising(packed: PackedRiccati, first: FloatArray | None = None) -> FloatArray | None:
     """Return covariances (N, n, n) whose gains stabilise H(12), by implicit steps, or None."""
     equations, n = packed.equations, len(packed.equations.A)
+    information = equations.G.sum(axis=0)
+    for group in equations.samples:
+        information += np.einsum("kpi,kpj->ij", group.H, np.linalg.solve(group.R, group.H))
+    # A mode that is hidden and neither grows nor decays ends in steps so long that it looks damped.
+    if undetectable_mode(equations.A, information) is not None:
+        return None
     size = max(float(np.abs(x).max()) for x in (equations.Q, equations.start, [[1e-12]]))
     # The multiple of I makes P positive definite where start and Q are singular.
     P = equations.start + equations.Q + 1e-3 * size * np.eye(n) if first is None else first
