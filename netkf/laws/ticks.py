@@ -11,6 +11,7 @@ import scipy
 from netkf.core.clock import Entity
 from netkf.core.laws import EXPONENTIAL, Lattice, WaitingLaw
 from netkf.laws.intervals import (
+    NO_COMPARISON,
     POWER,
     Comparison,
     Interval,
@@ -254,12 +255,16 @@ def count_interval(
     return distance._replace(value=value, low=low, high=high, detectable=detectable, again=limits)
 
 
-def compare_gaps(counts: TickCounts, level: float) -> tuple[Comparison, Interval | None]:
-    """Compare the gaps of R runs with their law, and return besides an interval for the
-    correlation of neighbouring ones, None for few; each holds at half of ``level``.
+def compare_gaps(counts: TickCounts, level: float) -> tuple[Comparison, Comparison]:
+    """Compare the gaps of R runs with their law, and the correlation of neighbouring ones with 0;
+    each gets half of ``level``.
     """
+    shares = compare_shares(counts.cells.sum(axis=0), level / 2.0, "gaps")
     correlation = neighbour_correlation(counts.products, level / 2.0)
-    return compare_shares(counts.cells.sum(axis=0), level / 2.0, "gaps"), correlation
+    if correlation is None:
+        return shares, NO_COMPARISON
+    distance = deviation_interval(0.0, correlation)
+    return shares, Comparison([(distance, "neighbouring gaps")], "largest correlation")
 
 
 def compare_clocks(

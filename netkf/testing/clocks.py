@@ -15,7 +15,7 @@ from netkf.core.clock import ClockPosition, Entity, generate_ticks
 from netkf.core.errors import ScenarioError
 from netkf.core.laws import EXPONENTIAL, Lattice
 from netkf.laws import stack_runs
-from netkf.laws.intervals import Comparison, deviation_interval
+from netkf.laws.intervals import Comparison
 from netkf.laws.noise import compare_correlations
 from netkf.laws.stating import stated_law, stating_class
 from netkf.laws.ticks import (
@@ -277,11 +277,7 @@ def _check_gaps(
         rule = f"must have the law of {parent}"
         first = _count(group, [[ticks[:1] for ticks in one] for one in times], horizon)
         demand_agreement(compare_gaps(first, family_level())[0], where, rule, remedy)
-    shares, correlation = compare_gaps(counts, family_level())
-    demand_agreement(shares, where, rule, remedy)
-    if correlation is not None:
-        distance = deviation_interval(0.0, correlation)
-        comparison = Comparison([(distance, "neighbouring gaps")], "largest correlation")
+    for comparison in compare_gaps(counts, family_level()):
         demand_agreement(comparison, where, rule, remedy)
 
 

@@ -11,14 +11,14 @@ import numpy as np
 
 from netkf.checks import evidence
 from netkf.checks.evidence import Assumption, Finding, Promise, find_identity
-from netkf.checks.laws import find, find_largest
+from netkf.checks.laws import find
 from netkf.checks.parts import events
 from netkf.checks.parts.events import loss_law, stated_delay
 from netkf.checks.parts.samples import PartSamples
 from netkf.core.clock import Entity
 from netkf.core.errors import ScenarioError
 from netkf.laws import delays, losses, ticks
-from netkf.laws.intervals import Comparison, deviation_interval, with_drawn
+from netkf.laws.intervals import Comparison, with_drawn
 from netkf.laws.stating import stated_part
 from netkf.laws.ticks import ClockGroup
 from netkf.linalg.arrays import FloatArray
@@ -140,19 +140,15 @@ def _check_rates(clocks: Clocks, samples: PartSamples, level: float) -> Finding:
 
 
 def _check_gaps(clocks: Clocks, samples: PartSamples, level: float) -> Finding:
-    shares, correlation = ticks.compare_gaps(getattr(samples, clocks.field), level)
+    shares, neighbours = ticks.compare_gaps(getattr(samples, clocks.field), level)
     finding = find(shares, SHARE_TOLERANCE)
-    if correlation is None:
-        return finding
-    distance = deviation_interval(0.0, correlation)
     # The correlation is reported if it is significant, and the law of single gaps is not wrong.
-    if distance.low > 0.0 and not finding.margin[2] < 0.0:
-        label = "neighbouring gaps"
-        return find_largest([(distance, label)], finding.tolerance, "largest correlation")
-    text = f"; correlation of neighbouring gaps {correlation.value:.2g}"
-    return finding._replace(
-        message=f"{finding.message}{text}, {distance.detectable:.2g} is detectable"
-    )
+    if neighbours.worst is not None and not finding.margin[2] < 0.0:
+        return find(neighbours, SHARE_TOLERANCE)
+    for distance, _ in neighbours.distances:
+        text = f"{finding.message}; correlation of neighbouring gaps {distance.seen:.2g}"
+        return finding._replace(message=f"{text}, {distance.detectable:.2g} is detectable")
+    return finding
 
 
 def _check_lattice(clocks: Clocks, samples: PartSamples, level: float) -> Finding:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import bisect
 import dataclasses
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -58,18 +58,18 @@ def path_law(scenario: Scenario) -> PathLaw | None:
         return None
     stated: Any = stated_part(scenario.plant, "plant")
     if scenario.slotted:
-        slots = min(MAX_STEPS, int(scenario.horizon / stated.period))
-        times, n = stated.period * np.arange(slots + 1), stated.n
-        numbers = [bisect.bisect_right(stated.change_slots, slot) for slot in range(slots)]
+        slots = np.arange(min(MAX_STEPS, int(scenario.horizon / stated.period)) + 1)
+        times, numbers = stated.period * slots, slots[:-1].tolist()
         laws = [(np.asarray(piece.F), np.asarray(piece.Q)) for piece in stated.pieces]
-        steps = [laws[number] for number in numbers]
+        steps = [laws[bisect.bisect_right(stated.change_slots, slot)] for slot in numbers]
     else:
         even = np.linspace(0.0, scenario.horizon * (1.0 - 1e-9), MAX_STEPS + 1)
-        times, n = scenario.time_grid.snap(even), stated.n
+        times = scenario.time_grid.snap(even)
         if len(stated.changes):
             steps = [_step_law(stated, *ends) for ends in itertools.pairwise(times.tolist())]
         else:
             steps = [transition_law(stated.A, stated.B, float(times[1]))] * MAX_STEPS
+    n = stated.n
     mean, covariance, sizes = stated.start_mean, stated.start_cov, []
     factors = {id(W): whiten(W, MIN_VARIANCE_SHARE).factor for _, W in steps}
     rank = max((len(factor) for factor in factors.values()), default=0)
@@ -83,14 +83,20 @@ def path_law(scenario: Scenario) -> PathLaw | None:
     return PathLaw(times, Phi_of_steps, white, deviation, np.array(sizes).reshape(-1, n))
 
 
+def pieces_between(plant: Any, changes: Sequence[Any], start: Any, end: Any) -> Iterator[Any]:
+    """Yield each piece of a plant with ``changes`` from ``start`` to ``end``, and how long it is
+    (seconds, or slots).
+    """
+    cuts = [change for change in changes if start < change < end]
+    for begin, stop in itertools.pairwise([start, *cuts, end]):
+        yield plant.pieces[bisect.bisect_right(changes, begin)], stop - begin
+
+
 def _step_law(plant: Diffusion, start: float, end: float) -> tuple[FloatArray, FloatArray]:
     """Return the transition matrix and the covariance of the noise of a plant that changes."""
-    changes = plant.changes.tolist()
-    cuts = [change for change in changes if start < change < end]
     Phi, W = np.eye(plant.n), np.zeros((plant.n, plant.n))
-    for begin, stop in itertools.pairwise([start, *cuts, end]):
-        piece = plant.pieces[bisect.bisect_right(changes, begin)]
-        F, Q = transition_law(piece.A, piece.B, stop - begin)
+    for piece, gap in pieces_between(plant, plant.changes.tolist(), start, end):
+        F, Q = transition_law(piece.A, piece.B, gap)
         Phi, W = F @ Phi, F @ W @ F.T + Q
     return Phi, W
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import bisect
 import dataclasses
-import itertools
 from collections import Counter
 from typing import Any
 
@@ -12,6 +10,7 @@ import numpy as np
 import scipy
 
 from netkf.algorithms.registry import own_attributes
+from netkf.checks.parts.noises import pieces_between
 from netkf.checks.rounding import EPS
 from netkf.linalg.arrays import FloatArray
 from netkf.rng.streams import Streams
@@ -90,15 +89,13 @@ def drawn_states(
         return x, 1e3 * allowed
     changes = plant.change_slots if scenario.slotted else plant.changes.tolist()
     for k in range(1, len(x)):
-        cuts = [change for change in changes if moments[k - 1] < change < moments[k]]
         step = np.eye(scenario.plant.n)
         with np.errstate(all="ignore"):
-            for start, end in itertools.pairwise([moments[k - 1], *cuts, moments[k]]):
-                piece = plant.pieces[bisect.bisect_right(changes, start)]
+            for piece, gap in pieces_between(plant, changes, moments[k - 1], moments[k]):
                 if scenario.slotted:
-                    step = np.linalg.matrix_power(piece.F, end - start) @ step
+                    step = np.linalg.matrix_power(piece.F, gap) @ step
                 else:
-                    step = scipy.linalg.expm(piece.A * (end - start)) @ step
+                    step = scipy.linalg.expm(piece.A * gap) @ step
             growth = float(np.linalg.norm(step, 2)) if np.isfinite(step).all() else np.inf
         allowed[k] = max(allowed[k], growth * (allowed[k - 1] + ROUNDINGS * EPS * sizes[k - 1]))
     return x, allowed
