@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import scipy
@@ -53,6 +53,9 @@ FRAME_TOLERANCE = 1e-6
 """Relative difference of equal paths in frames."""
 MAX_LOG_GROWTH = math.log(1e6)
 """Logarithm of the largest growth of the state of an unstable plant in a run."""
+SLOT_TEXTS = "Q", "x[k+1] must be F x[k] where Q has no noise", "powers of F"
+FLOW_TEXTS = "B", "x(t + g) must be e^(A g) x(t) where B has no noise", "e^{A t}"
+"""What messages say of plants: the field that states the noise, the rule of a step, and of many."""
 GAPS = (0.7, 0.2, 1.0, 0.05)
 """Gaps between the times of a path, in units of the time constant of the plant."""
 
@@ -226,44 +229,35 @@ def _check_noise(
         check_uncorrelated(start, e[:, 0], labels._replace(noise="x(0) and the noise"), "after it")
 
 
-class Steps(NamedTuple):
-    """The steps ``x[k+1] = Phi x[k] + w`` of paths: Phi and the covariance of w, both (n, n), and
-    what messages call w, of each law in turn; the field that states the noise, and texts of the
-    rule that a step follows its law, and of the powers of Phi.
-    """
-
-    laws: list[tuple[FloatArray, FloatArray, str]]
-    field: str
-    rule: str
-    power: str
-
-
 def _check_paths(
     plants: tuple[Any, Any],
     where: str,
     draw: Callable[..., FloatArray],
     at: FloatArray,
-    subsets: Mapping[str, list[int]],
-    steps: Steps,
+    subset: tuple[str, list[int]],
+    laws: Sequence[tuple[FloatArray, FloatArray, str]],
     runs: int,
 ) -> None:
-    """Check the paths of a plant and its copy, ``draw(plant, at, run)`` (K, n) ``at`` K times."""
+    """Check the paths of a plant and its copy, ``draw(plant, at, run)`` (K, n) ``at`` K times. A
+    step is ``x[k+1] = Phi x[k] + w``, with ``laws`` in turn: Phi and the covariance of w, both
+    (n, n), and what messages call w.
+    """
     part, copy = plants
-    path = draw(part, at)
+    field, rule, power = SLOT_TEXTS if isinstance(part, LinearPlant) else FLOW_TEXTS
+    path, (when, few) = draw(part, at), subset
     _demand_same(where, path, draw(part, at), "at the second call")
     _demand_same(where, path, draw(copy, at), "of a pickled plant")
-    for when, subset in subsets.items():
-        _demand_same(where, path[subset], draw(part, at[subset]), when)
-    transitions, laws = [np.eye(part.n)], steps.laws
+    _demand_same(where, path[few], draw(part, at[few]), when)
+    transitions = [np.eye(part.n)]
     for k in range(len(at) - 1):
         transitions.append(laws[k % len(laws)][0] @ transitions[-1])
-    _check_moved(part, where, lambda plant: draw(plant, at), transitions, steps.power)
+    _check_moved(part, where, lambda plant: draw(plant, at), transitions, power)
     states = np.array([draw(part, at, run) for run in range(runs)])
     for k, (Phi, S, noise) in enumerate(laws):
         after = states[:, k + 1 :: len(laws)]
         before = states[:, k : -1 : len(laws)][:, : after.shape[1]]
-        labels = NoiseLabels(where, noise, steps.field)
-        _check_noise(after - before @ Phi.T, S, before, labels, steps.rule)
+        labels = NoiseLabels(where, noise, field)
+        _check_noise(after - before @ Phi.T, S, before, labels, rule)
 
 
 def _check_slots(part: LinearPlant, copy: LinearPlant, name: str, seed: int) -> None:
@@ -280,12 +274,12 @@ def _check_slots(part: LinearPlant, copy: LinearPlant, name: str, seed: int) -> 
     if factor > 1.0:
         length = max(8, min(LENGTH, int(MAX_LOG_GROWTH / math.log(factor))))
     slots = np.arange(length + 1.0)
-    subset = [0, 0, 3, length // 2, length // 2, length]
-    subsets = {"when slots are left out or asked for twice": subset}
-    law, runs = (part.F, part.Q, "the noise x[k+1] - F x[k]"), min(MAX_RUNS, STEPS // length)
-    steps = Steps([law], "Q", "x[k+1] must be F x[k] where Q has no noise", "powers of F")
+    few = [0, 0, 3, length // 2, length // 2, length]
+    subset = "when slots are left out or asked for twice", few
+    laws = [(part.F, part.Q, "the noise x[k+1] - F x[k]")]
+    runs = max(2, min(MAX_RUNS, STEPS // length))
     is_inherited = type(part).truth is LinearPlant.truth
-    _check_paths((part, copy), where, draw, slots, subsets, steps, max(2, runs))
+    _check_paths((part, copy), where, draw, slots, subset, laws, runs)
     path = draw(part, slots)
     with guard_user_code(where):
         # The same run once more, in frames.
@@ -340,11 +334,9 @@ def _check_sampled(
     for gap in (time_constant * np.array(GAPS)).tolist():
         text = f"the noise x(t + g) - e^(A g) x(t) over {gap:.3g} s"
         laws.append((*transition_law(part.A, part.B, gap), text))
-    rule = "x(t + g) must be e^(A g) x(t) where B has no noise"
-    subsets = {"at every third time alone": list(range(0, len(times), 3))}
+    subset = "at every third time alone", list(range(0, len(times), 3))
     runs = max(2, min(MAX_RUNS, STEPS // (2 * len(times))))
-    steps = Steps(laws, "B", rule, "e^{A t}")
-    _check_paths((part, copy), where, draw, times, subsets, steps, runs)
+    _check_paths((part, copy), where, draw, times, subset, laws, runs)
 
 
 def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:

@@ -68,12 +68,7 @@ class Clocks(NamedTuple):
 
 
 NETWORK = Clocks(
-    events.network_clocks,
-    "ticks",
-    events.draw_ticks,
-    evidence.CLOCKS,
-    "clocks tick",
-    "ticks",
+    events.network_clocks, "ticks", events.draw_ticks, evidence.CLOCKS, "clocks tick", "ticks"
 )
 SENSORS = Clocks(
     events.sampling_clocks,
@@ -190,12 +185,6 @@ def _clock_promises(clocks: Clocks, samples: PartSamples) -> list[Promise]:
     return rows
 
 
-def _of_losses(compare: Callable[..., Comparison], tolerance: float) -> Test:
-    return lambda samples, level: find(
-        compare(loss_law(samples.scenario), samples.fates, level), tolerance
-    )
-
-
 @lru_cache(maxsize=8)
 def pair_probabilities(scenario: Scenario) -> FloatArray | None:
     """Return the probability (L,) of each link to be in a matching; None if unknown."""
@@ -239,34 +228,33 @@ def _row(text: str, group: str, test: Test, *needs: str, exact: bool = False) ->
     return Promise(text, "the scenario", needs, test, exact, group)
 
 
-LOSS_ROW = _row(
+def _loss_row(
+    text: str, compare: Callable[..., Comparison], tolerance: float, *needs: str
+) -> Promise:
+    def test(samples: PartSamples, level: float) -> Finding:
+        return find(compare(loss_law(samples.scenario), samples.fates, level), tolerance)
+
+    return _row(text, evidence.LOSSES, test, DRAWN, STATED, *needs)
+
+
+LOSS_ROW = _loss_row(
     "messages are lost as often as the scenario says, in each direction",
-    evidence.LOSSES,
-    _of_losses(losses.compare_losses, PROBABILITY_TOLERANCE),
-    DRAWN,
-    STATED,
+    losses.compare_losses,
+    PROBABILITY_TOLERANCE,
 )
-LOSSES_APART = _row(
+LOSSES_APART = _loss_row(
     "messages are lost independently of each other",
-    evidence.LOSSES,
-    _of_losses(losses.compare_independence, CORRELATION_TOLERANCE),
-    DRAWN,
-    STATED,
+    losses.compare_independence,
+    CORRELATION_TOLERANCE,
     SAME,
 )
-BURSTS = _row(
-    "losses follow each other as the scenario says",
-    evidence.LOSSES,
-    _of_losses(losses.compare_bursts, PROBABILITY_TOLERANCE),
-    DRAWN,
-    STATED,
+BURSTS = _loss_row(
+    "losses follow each other as the scenario says", losses.compare_bursts, PROBABILITY_TOLERANCE
 )
-SHARED_ROW = _row(
+SHARED_ROW = _loss_row(
     "hearers of a broadcast lose it together as often as the scenario says",
-    evidence.LOSSES,
-    _of_losses(losses.compare_shares, PROBABILITY_TOLERANCE),
-    DRAWN,
-    STATED,
+    losses.compare_shares,
+    PROBABILITY_TOLERANCE,
     SAME,
 )
 MATCHING_ROW = _row(
