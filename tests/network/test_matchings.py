@@ -98,3 +98,10 @@ def test_detecting_walk_of_two_that_always_swap():
     rows = {"plant.F": [[0.0, -1.1], [1.1, 0.0]]}
     scenario = netkf.load(SCENARIOS / "gossip_periodic.toml").replace(rows)
     assert theory.detecting_walk(scenario) is None
+    # A swap that is lost leaves both alone, and the turn shows a sensor the other axis.
+    for delivery, expected in ((0.5, (True, True)), (0.0, (False, True))):
+        loss = {"kind": "bernoulli", "delivery": delivery}
+        lossy = scenario.replace({"network.channel.loss": loss})
+        holds = theory.assumptions(lossy).set_index("source").holds
+        assert (holds["G C.1"], holds["G D.1"]) == expected
+        assert len(set(theory.detecting_walk(lossy))) == 1

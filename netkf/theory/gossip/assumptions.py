@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from netkf.core.errors import TheoryError
-from netkf.linalg.arrays import FloatArray
 from netkf.network.losses import NoLoss
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import AssumptionRow
 from netkf.theory.common.plant_assumptions import slot_plant_rows, start_rows
 from netkf.theory.gossip.matchings import (
     detecting_walk,
-    effective_matching,
-    mean_matching,
+    mean_swaps,
     period_of,
 )
 
@@ -32,7 +30,7 @@ def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
 def _matching_rows(scenario: Scenario) -> list[AssumptionRow]:
     name = "the mean matching is irreducible and aperiodic"
     try:
-        mean = _mean_swaps(scenario)
+        mean = mean_swaps(scenario)
     except TheoryError as error:
         return [(name, "G C.1", None, f"not decided: {error}")]
     # Irreducible and aperiodic together mean that some power of the matrix is positive (C.1).
@@ -47,14 +45,6 @@ def _matching_rows(scenario: Scenario) -> list[AssumptionRow]:
     else:
         evidence = f"least positive entry {mean[mean > 0.0].min():.3g}"
     return [(name, "G C.1", period == 1, evidence)]
-
-
-def _mean_swaps(scenario: Scenario) -> FloatArray:
-    """Return Abar (N, N) with the losses if these are known, else of the matching alone."""
-    try:
-        return effective_matching(scenario)
-    except TheoryError:
-        return mean_matching(scenario)
 
 
 def _walk_rows(scenario: Scenario) -> list[AssumptionRow]:

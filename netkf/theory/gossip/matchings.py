@@ -58,6 +58,14 @@ def effective_matching(scenario: Scenario) -> FloatArray:
     return mean
 
 
+def mean_swaps(scenario: Scenario) -> FloatArray:
+    """Return Abar (N, N) with the losses if these are known, else of the matching alone."""
+    try:
+        return effective_matching(scenario)
+    except TheoryError:
+        return mean_matching(scenario)
+
+
 def _recorded_mean(scenario: Scenario, activation: RecordedSlots) -> FloatArray:
     """Return the mean (N, N) of the recorded exchange matrices, each row of which sums to 1."""
     period, index = scenario.slot_plant.period, scenario.topology.index
@@ -93,9 +101,10 @@ def detecting_walk(scenario: Scenario) -> list[int] | None:
 
     It is a walk on the graph of Abar with an invertible Gramian ``sum_k (F^k)' C' C F^k``, C of
     node n_k (G assumption D.1, weak detectability). It need not visit all nodes. D.1 is sufficient,
-    not necessary: a stable mode need not be observed.
+    not necessary: a stable mode need not be observed. Abar is that of the swaps that succeed: where
+    all messages of a link are lost no walk uses it, and where some are, nodes may stay alone.
     """
-    mean, nodes = mean_matching(scenario), scenario.nodes
+    mean, nodes = mean_swaps(scenario), scenario.nodes
     F, _ = scenario.slot_belief
     n = len(F)
     rows = [scenario.observation_matrices(node)[0] for node in scenario.nodes]
