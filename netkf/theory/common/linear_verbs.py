@@ -34,126 +34,18 @@ NO_PLACES, NO_FORMS = np.zeros((0, 2), dtype=np.int64), np.zeros((0, 0))
 
 
 @kernel
-def find_inputs(words: IntArray, written: int, row: IntArray, inputs: IntArray) -> int:
-    """Write the places of ``words`` that depend on noise into ``inputs``; return their number."""
-    number = 0
-    for i in range(len(words) - written):
-        if row[words[i]] >= 0:
-            inputs[number] = i
-            number += 1
-    return number
-
-
-@kernel
-def fill_blocks(
-    run: Any, blocks: FloatArray, stored: FloatArray, words: IntArray, count: int, changes: int
-) -> None:
-    """Copy the ``stored`` words into ``changes`` + 1 blocks, each with the ``count`` readings."""
-    for b in range(changes + 1):
-        for i in range(len(words)):
-            blocks[b, words[i]] = stored[words[i]]
-        for r in range(count):
-            for i in range(run.rows[r]):
-                run.y[b * count + r, i, 0] = 0.0
-                for j in range(len(run.size) if b > 0 else 0):
-                    run.H[b * count + r, i, j, 0] = run.H[r, i, j, 0]
-
-
-@kernel
-def change(
-    run: Any, block: FloatArray, words: IntArray, inputs: IntArray, number: int, places: IntArray,
-    count: int, b: int,
+def run_in_blocks(
+    record: Any, memories: np.ndarray, run: ClockRun, offsets: FloatArray, count: int,
+    predict: int, act: int, h: int, m: int, gap: float,
 ) -> None:  # fmt: skip
-    """Add 1 to what is different in ``block`` number b (W,); block 0 is as things are."""
-    for i in range(len(run.size)):
-        run.offset[i, 0] = 0.0
-    if b > number:
-        r, i = places[b - 1 - number, 0], places[b - 1 - number, 1]
-        if r < 0:
-            run.offset[i, 0] = 1.0
-        else:
-            run.y[b * count + r, i, 0] = 1.0
-    elif b > 0:
-        block[words[inputs[b - 1]]] += 1.0
-    run.first_y = run.first_H = b * count
-
-
-@kernel
-def read_map(
-    blocks: FloatArray, stored: FloatArray, is_float: np.ndarray, words: IntArray, row: IntArray,
-    keep: int, changes: int, out: FloatArray, found: IntArray,
-) -> int:  # fmt: skip
-    """Store the first ``keep`` words as things are, and write the linear map into ``out``. Return
-    the number of words that depend on noise without a row, whose places go into ``found``.
-    """
-    number = 0
-    for i in range(keep):
-        word, depends = words[i], False
-        stored[word] = blocks[0, word]
-        for b in range(changes):
-            out[i, b] = 0.0
-            if is_float[word] == 1:
-                out[i, b] = blocks[b + 1, word] - blocks[0, word]
-                depends = depends or out[i, b] != 0.0
-        if depends and row[word] < 0:
-            found[number] = i
-            number += 1
-    return number
-
-
-@kernel
-def move_forms(
-    table: FloatArray, used: int, words: IntArray, row: IntArray, keep: int, inputs: IntArray,
-    number: int, others: FloatArray, out: FloatArray, moved: FloatArray,
-) -> None:  # fmt: skip
-    """Apply a linear map ``out`` to the forms of its ``number`` inputs and ``others`` (k, C)."""
-    for i in range(keep):
-        if row[words[i]] < 0:
-            continue
-        for c in range(used):
-            moved[i, c] = 0.0
-        for k in range(number):
-            factor, source = out[i, k], row[words[inputs[k]]]
-            for c in range(used if factor != 0.0 else 0):
-                moved[i, c] += factor * table[source, c]
-        for k in range(len(others)):
-            factor = out[i, number + k]
-            for c in range(used if factor != 0.0 else 0):
-                moved[i, c] += factor * others[k, c]
-    for i in range(keep):
-        target = row[words[i]]
-        for c in range(used if target >= 0 else 0):
-            table[target, c] = moved[i, c]
-
-
-@kernel
-def probe(
-    record: Any, memories: np.ndarray, run: ClockRun, blocks: FloatArray, stored: FloatArray,
-    is_float: np.ndarray, words: IntArray, row: IntArray, keep: int, written: int,
-    places: IntArray, others: FloatArray, count: int, table: FloatArray, used: int,
-    predict: int, act: int, h: int, m: int, gap: float, inputs: IntArray, out: FloatArray,
-    moved: FloatArray, found: IntArray,
-) -> int:  # fmt: skip
     """Predict node ``h`` over ``gap`` seconds, if that is not 0, and run a verb, by their addresses
-    ``predict`` and ``act``, on the numbers ``words`` (w,) of the ``stored`` filters (W,), and apply
-    their linear map to the forms, rows ``row`` (W,) of ``table``. The first ``keep`` words are what
-    may change; the last ``written`` are only written. With a message ``m`` >= 0 the verb is
-    ``emit``.
-
-    The verb depends on further numbers, whose forms are ``others`` (k, C): ``places`` (k, 2) say
-    row i of reading r, or entry i of the offset for r = -1; there are ``count`` readings. They run
-    in ``blocks`` (B, W). Columns of the linear map are written into ``out``; ``moved`` is scratch.
-
-    Return 0; a negative number if it needs so many blocks; or how many words depend on noise now
-    that did not: their places are written into ``found``, and no form has changed.
+    ``predict`` and ``act``, in each of B blocks: with its ``memories`` (B, words), its ``offsets``
+    (B, n) and its ``count`` readings. With a message ``m`` >= 0 the verb is ``emit``.
     """
-    number = find_inputs(words, written, row, inputs)
-    changes = number + len(places)
-    if changes + 1 > len(blocks) or (changes + 1) * count > len(run.y):
-        return -(changes + 1)
-    fill_blocks(run, blocks, stored, words, count, changes)
-    for b in range(changes + 1):
-        change(run, blocks[b], words, inputs, number, places, count, b)
+    for b in range(len(offsets)):
+        for i in range(len(run.size)):
+            run.offset[i, 0] = offsets[b, i]
+        run.first_y = run.first_H = b * count
         if gap > 0.0:
             run.gap = gap
             call_at(predict, struct_like(record, memories[b]), h, run)
@@ -161,10 +53,6 @@ def probe(
             call_at_two(act, struct_like(record, memories[b]), h, m, run)
         elif act != NOTHING:
             call_at(act, struct_like(record, memories[b]), h, run)
-    new = read_map(blocks, stored, is_float, words, row, keep, changes, out, found)
-    if new == 0:
-        move_forms(table, used, words, row, keep, inputs, number, others, out, moved)
-    return int(new)
 
 
 class LinearVerbs:
@@ -212,8 +100,6 @@ class LinearVerbs:
         self._y, self._H = np.zeros((0, self._p, 1)), np.zeros((0, self._p, self.n, 1))
         self._rows = np.zeros(1 + self.messages, dtype=np.int64)
         self.run.rows, self.run.matrix = self._rows, np.arange(len(self._rows))
-        self._out = self._moved = np.zeros((0, 0))
-        self._inputs = self._found = np.zeros(0, dtype=np.int64)
 
     def _lay_out(self, arrays: dict[str, np.ndarray], rows: dict[str, np.ndarray]) -> None:
         """Store these ``arrays``; ``rows`` are rows in the forms by name, by default none."""
@@ -223,7 +109,7 @@ class LinearVerbs:
         self._shapes = {name: array.shape for name, array in arrays.items()}
         self._row = np.full(ends[-1], -1, dtype=np.int64)
         self._stored = np.zeros(ends[-1])
-        self._is_float = np.zeros(ends[-1], dtype=np.uint8)
+        self._is_float = np.zeros(ends[-1], dtype=bool)
         self._dtypes = {name: array.dtype for name, array in arrays.items()}
         for name, array in arrays.items():
             self._view(name)[...] = array
@@ -264,6 +150,7 @@ class LinearVerbs:
         if count <= len(self._blocks):
             return
         self._blocks = blocks = np.zeros((2 * count, len(self._stored)))
+        self._no_offsets = np.zeros((2 * count, self.n))
         first, views = self._template, {}
         for name, begin in self._begin.items():
             shape = self._shapes[name]
@@ -340,14 +227,16 @@ class LinearVerbs:
         self._row[words] = -1
 
     def _set_readings(self, matrices: Sequence[FloatArray], blocks: int) -> None:
-        """Make readings with these H (p, n) those of the run, with room for so many ``blocks``."""
+        """Make readings of 0 with these H (p, n) those of the run, in so many ``blocks``."""
         run, count = self.run, len(matrices)
-        if blocks * count > len(self._y):
-            size = 2 * blocks * count
-            self._y, self._H = np.zeros((size, self._p, 1)), np.zeros((size, self._p, self.n, 1))
+        size = blocks * count
+        if size > len(self._y):
+            self._y = np.zeros((2 * size, self._p, 1))
+            self._H = np.zeros((2 * size, self._p, self.n, 1))
             run.y, run.H = self._y, self._H
+        self._y[:size] = 0.0
         for r, H in enumerate(matrices):
-            self._H[r, : len(H), :, 0] = H
+            self._H[r:size:count, : len(H), :, 0] = H
             self._rows[r] = len(H)
 
     def predict(self, h: int, gap: float) -> None:
@@ -433,48 +322,52 @@ class LinearVerbs:
         others: FloatArray = NO_FORMS,
         readings: Sequence[FloatArray] = (),
     ) -> None:
-        """Predict, and run a ``verb``, if there is one, on ``words``, see ``probe``."""
+        """Predict, and run a ``verb``, if there is one, on the numbers ``words`` (w,), and apply
+        their linear map to the forms. The first ``keep`` words are what may change, by default all;
+        the last ``written`` are only written. The verb depends on further numbers, whose forms are
+        ``others`` (k, C): ``places`` (k, 2) say row i of reading r, or entry i of the offset for
+        r = -1. With a message ``m`` it is ``emit``.
+        """
         predict, act = address_of(self.kernels.predict, self._record, self.run), NOTHING
         if verb is not None:
             act = address_of(verb, self._record, self.run, 1 if m < 0 else 2)
-        keep, forms = len(words) if keep is None else keep, self.forms
-        self._fit(len(words), keep)
-        needed, found, record = 1, -1, any_struct(self._record)
-        while found < 0:
-            if readings:
-                self._set_readings(readings, needed)
-            found = probe(
-                record, self._memories, self.run.general, self._blocks, self._stored,
-                self._is_float, words, self._row, keep, written, places, others, len(readings),
-                forms.table, forms.used, predict, act, h, m, gap, self._inputs, self._out,
-                self._moved, self._found,
-            )  # fmt: skip
-            if found < 0:
-                needed = -found
-                self._fit_blocks(needed)
-                self._fit(len(words), keep)
-        if found == 0:
-            return
-        # Some words depend on noise now that did not before.
-        rows = self._row[words]
+        kept, forms, rows = words[:keep], self.forms, self._row[words]
+        # Block 0 is as things are without noise; in each other one 1 is added to one number.
         inputs = np.flatnonzero(rows[: len(words) - written] >= 0)
+        changes, count = 1 + len(inputs) + len(places), len(readings)
+        self._fit_blocks(changes)
+        if readings:
+            self._set_readings(readings, changes)
+        blocks, offsets = self._blocks[:changes], self._no_offsets[:changes]
+        blocks[:, words] = self._stored[words]
+        if len(inputs):
+            blocks[np.arange(1, 1 + len(inputs)), words[inputs]] += 1.0
+        if len(places):
+            number, (r, i) = np.arange(1 + len(inputs), changes), places.T
+            if readings:
+                self._y[number * count + r, i, 0] = 1.0
+            else:
+                offsets = offsets.copy()
+                offsets[number, i] = 1.0
+        run_in_blocks(
+            any_struct(self._record), self._memories, self.run.general, offsets, count, predict,
+            act, h, m, gap,
+        )  # fmt: skip
+        self._stored[kept] = blocks[0, kept]
+        if changes == 1:
+            return
+        floats = np.flatnonzero(self._is_float[kept])
+        values, own = blocks[:, kept[floats]], rows[floats]
+        linear = (values[1:] - values[0]).T
         given = forms.table[rows[inputs], : forms.used]
         if len(others):
             given = np.concatenate([given, others[:, : forms.used]])
-        new = self._found[:found]
-        rows[new] = self._row[words[new]] = forms.take(found)
-        targets = np.flatnonzero(rows[:keep] >= 0)
-        forms.table[rows[targets], : forms.used] = self._out[targets, : len(given)] @ given
-
-    def _fit(self, words: int, keep: int) -> None:
-        """Make room for the results of a verb on so many words, of which ``keep`` may change."""
-        width, blocks = self.forms.table.shape[1], len(self._blocks)
-        if self._moved.shape[1] < width or len(self._moved) < keep:
-            self._moved = np.zeros((max(2 * keep, len(self._moved)), width))
-        if self._out.shape[1] < blocks or len(self._out) < keep:
-            self._out = np.zeros((max(2 * keep, len(self._out)), blocks))
-        if len(self._inputs) < words:
-            self._inputs, self._found = (np.zeros(2 * words, dtype=np.int64) for _ in range(2))
+        # Some words depend on noise now that did not before.
+        new = np.flatnonzero((own < 0) & linear.any(axis=1))
+        if len(new):
+            own[new] = self._row[kept[floats[new]]] = forms.take(len(new))
+        targets = own >= 0
+        forms.table[own[targets], : forms.used] = linear[targets] @ given
 
 
 def _memories(struct: Any, arrays: dict[str, np.ndarray], steps: IntArray) -> np.ndarray:
