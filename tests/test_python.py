@@ -232,3 +232,18 @@ def test_completion_offers_public_names_only():
         private = {"annotations", "Any", "TYPE_CHECKING", "importlib", "np"}
         assert not private & set(dir(module))
         assert all(hasattr(module, name) for name in dir(module))
+
+
+@pytest.mark.parametrize("odd", [None, "x", 1j, np.eye(2), {}])
+def test_arguments_of_a_wrong_kind_are_one_line(odd, ring):
+    calls = {
+        "run": lambda: netkf.innovations(odd),
+        "engine": lambda: netkf.simulate(ring, engine=odd),
+        "--vary": lambda: netkf.sweep(ring, odd),
+        "low": lambda: netkf.size(ring, "filter.epsilon", odd, 0.2, "worst_rms<=1"),
+        "--vary: ": lambda: netkf.size(ring, odd, 0.1, 0.2, "worst_rms<=1"),
+    }
+    for name, call in calls.items():
+        with pytest.raises(netkf.NetkfError, match=name) as caught:
+            call()
+        assert "\n" not in str(caught.value)

@@ -16,6 +16,10 @@ class NetkfError(Exception):
 class TheoryError(NetkfError, ValueError):
     """The conditions of a theorem fail; the message names the condition."""
 
+    def __init__(self, message: str) -> None:
+        """Take the message as one line, whatever values it quotes."""
+        super().__init__(" ".join(message.split()))
+
 
 class EngineError(NetkfError, RuntimeError):
     """An engine cannot run a scenario; the message names the cause and the remedy."""

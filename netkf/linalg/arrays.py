@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import numbers
 from collections.abc import Sequence
 from functools import cache
 from typing import Any
@@ -21,6 +22,7 @@ __all__ = [
     "block_diagonal",
     "enlarged",
     "readonly_array",
+    "real_numbers",
     "is_definite",
     "is_semidefinite",
     "as_kernel_array",
@@ -42,12 +44,22 @@ def readonly_array(value: ArrayLike) -> FloatArray:
     """Return a read-only float64 copy of an array or nested lists of any shape; raises TypeError or
     ValueError for what is none of real numbers.
     """
-    if np.iscomplexobj(value):
-        raise TypeError("complex numbers")  # numpy would drop their imaginary parts
     # A copy: the caller may go on writing into its own array.
-    array = np.array(value, dtype=np.float64)
+    array = np.array(real_numbers(value))
     array.flags.writeable = False
     return array
+
+
+def real_numbers(value: ArrayLike) -> FloatArray:
+    """Return ``value`` as a float64 array; raises as ``readonly_array``."""
+    array = np.asarray(value)
+    # numpy would drop imaginary parts and masks, count dates in days, and read texts.
+    is_real = array.dtype.kind in "biuf"
+    if array.dtype.kind == "O":
+        is_real = all(isinstance(number, numbers.Number) for number in array.flat)
+    if not is_real or np.ma.is_masked(value):
+        raise TypeError(f"no real numbers: {array.dtype}")
+    return np.asarray(array, dtype=np.float64)
 
 
 def symmetric(matrices: FloatArray) -> FloatArray:

@@ -8,6 +8,7 @@ import numpy as np
 
 from netkf.core.errors import EngineError, ScenarioError
 from netkf.core.fields import integer
+from netkf.core.printable import shorten
 from netkf.engines.base import Engine, Progress, silent
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.linalg.plain import is_plain
@@ -29,14 +30,16 @@ def choose_engine(
     """
     if isinstance(name_or_engine, Engine):
         engine: Engine = name_or_engine
+    elif str(name_or_engine) not in (*ENGINES, "processes"):
+        raise EngineError(
+            f"engine must be one of {', '.join(ENGINES)}; got {shorten(repr(name_or_engine))}"
+        )
     elif name_or_engine in ("auto", "compiled"):
         engine = CompiledEngine()
         if name_or_engine == "auto" and (is_plain() or engine.refusal(scenario) is not None):
             engine = _simpy_engine()
-    elif name_or_engine in ("simpy", "processes"):
-        engine = _simpy_engine()
     else:
-        raise EngineError(f"engine must be one of {', '.join(ENGINES)}; got {name_or_engine!r}")
+        engine = _simpy_engine()
     refusal = engine.refusal(scenario)
     if refusal is not None:
         raise EngineError(refusal)

@@ -26,6 +26,7 @@ from netkf.core.fields import number
 from netkf.core.notebook import NotebookTable
 from netkf.laws.intervals import POWER
 from netkf.linalg.arrays import FloatArray
+from netkf.runs.files import require_run
 from netkf.runs.simulate import simulate
 from netkf.runs.summary import chi_square_interval
 from netkf.runs.tables import format_number, format_table, shorten_rows
@@ -188,7 +189,7 @@ def innovations(run: Run | Scenario, confidence: float = 0.99) -> InnovationTest
     confidence = number(above=0.0, below=1.0)("confidence", confidence)
     if isinstance(run, Scenario):
         run = simulate(run)
-    return judge_innovations(run.scenario, recorded_innovations(run), confidence)
+    return judge_innovations(require_run(run), recorded_innovations(run), confidence)
 
 
 def recorded_innovations(run: Run) -> Innovations:

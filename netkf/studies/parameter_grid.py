@@ -81,7 +81,8 @@ def _are_finite(*texts: str) -> bool:
 def check_grid(grid: Any) -> dict[str, list[Any]]:
     """Return the values of each key of a user's ``grid``; raises ScenarioError."""
     if not isinstance(grid, Mapping) or not grid:
-        raise ScenarioError("--vary", "needs a key with its values", grid or None, "KEY=V1,V2,...")
+        found = None if isinstance(grid, Mapping) else grid
+        raise ScenarioError("--vary", "needs a key with its values", found, "KEY=V1,V2,...")
     values_by_key = {}
     for key, values in grid.items():
         listed = isinstance(values, (list, tuple, range, np.ndarray)) and len(values)

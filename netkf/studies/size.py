@@ -107,8 +107,11 @@ def size(
 
 def _check_range(scenario: Scenario, key: str, low: float, high: float) -> bool:
     """Return whether the ``key`` has integers as values; raises ScenarioError for a bad range."""
+    if not isinstance(key, str):
+        raise ScenarioError("--vary", "needs a key, as filter.epsilon", key, "give its path")
     is_integer = is_integer_key(scenario, key)
-    for end in (low, high):
+    for name, end in (("low", low), ("high", high)):
+        number()(name, end)
         if is_integer and not isinstance(end, int):
             rule = f"{key} is an integer, so LOW:HIGH must be integers"
             raise ScenarioError("--vary", rule, f"{low}:{high}", "leave out the decimals")

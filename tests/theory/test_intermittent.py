@@ -240,7 +240,9 @@ def test_critical_probability_does_not_depend_on_units_of_outputs_or_states(unit
 
 
 def test_arguments_of_a_wrong_kind_are_refused_with_one_line():
-    """A number where a list is meant, text, lists of unequal length, complex, None, masked."""
+    """A number where a list is meant, text, lists of unequal length, complex, None, masked, dates,
+    which numpy counts in days, and numbers as text.
+    """
     hybrid = netkf.load(SCENARIOS / "poisson_ring.toml")
     push_sum = netkf.load(SCENARIOS / "push_sum_planar.toml")
     eye = np.eye(2)
@@ -263,13 +265,17 @@ def test_arguments_of_a_wrong_kind_are_refused_with_one_line():
         "covariances": lambda x: theory.push_sum_covariances(push_sum, x),
         "up": lambda x: theory.mass_totals(push_sum, x),
         "graph": lambda x: theory.disconnection_probability(x, 0.5),
+        "topology": theory.consensus_gain_bound,
         "P": lambda x: theory.one_bit_update(x, [[1.0, 0.0]], 1.0),
         "trigger": lambda x: theory.trigger_rate(x, [[1.0, 0.0]], 1.0, 1.0),
         "scalar F": lambda x: theory.scalar_law(x, 1.0, 1.0, 1.0, 0.5),
     }
     calls = [(f, x) for f in takes_number.values() for x in ([0.5, 0.6], "text", None, 1j)]
+    odd = ("2", np.datetime64(1, "D"), np.timedelta64(1, "D"), np.eye(2).astype(str))
+    calls += [(f, x) for f in takes_number.values() for x in odd]
     calls += [(f, x) for f in takes_list.values() for x in ("text", None, 1j, [1, [2, 3]])]
-    calls.append((lambda x: theory.lyapunov_step(eye, x, eye), masked))
+    for value in (masked, eye.astype("m8[D]"), eye.astype(str), [["1", 0], [0, 1]]):
+        calls.append((lambda x: theory.lyapunov_step(eye, x, eye), value))
     for call, value in calls:
         with pytest.raises(netkf.TheoryError) as caught:
             call(value)

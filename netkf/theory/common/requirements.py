@@ -8,6 +8,7 @@ from functools import wraps
 from typing import Any
 
 from netkf.core.errors import ScenarioError, TheoryError
+from netkf.network.graphs import Topology
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.blocks import have_one_view, scenario_of_view
 
@@ -32,6 +33,15 @@ def require_scenario(functions: dict[str, Any]) -> dict[str, Any]:
             if first is not None and first.annotation == "Scenario":
                 wrapped[name] = _check_first_argument(name, function)
     return wrapped
+
+
+def topology_of(graph: object) -> Topology:
+    """Return the graph of a scenario, or a graph; raises TheoryError for anything else."""
+    topology = graph.topology if isinstance(graph, Scenario) else graph
+    if not isinstance(topology, Topology):
+        message = "graph must be a netkf.Scenario or its topology"
+        raise TheoryError(f"{message}, got a {type(graph).__name__}")
+    return topology
 
 
 def scenario_of_estimates(scenario: Scenario) -> Scenario:

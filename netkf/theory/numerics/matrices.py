@@ -12,7 +12,14 @@ import scipy
 from netkf.algorithms.kernels.riccati import move_covariances
 from netkf.algorithms.kernels.riccati import riccati_flow as flow_over
 from netkf.core.errors import TheoryError
-from netkf.linalg.arrays import ArrayLike, FloatArray, is_semidefinite, square_root, symmetric
+from netkf.linalg.arrays import (
+    ArrayLike,
+    FloatArray,
+    is_semidefinite,
+    real_numbers,
+    square_root,
+    symmetric,
+)
 from netkf.linalg.spectra import RATE, growth_rate, hidden_mode, outputs_of
 
 RESIDUAL = 1e-9  # of an equation, relative to its terms: larger ones mean a failed solver
@@ -24,9 +31,7 @@ MAX_STATES = 6
 def as_numbers(name: str, value: ArrayLike) -> FloatArray:
     """Return ``value`` as a float array, a number as (1, 1); a TheoryError calls it ``name``."""
     try:
-        if np.iscomplexobj(value) or np.ma.is_masked(value):
-            raise TypeError
-        array: FloatArray = np.asarray(value, dtype=np.float64)
+        array = real_numbers(value)
     except (TypeError, ValueError, OverflowError):
         message = "must be a matrix of real numbers, rows of equal length"
         raise TheoryError(f"{name} {message}, got a {type(value).__name__}") from None
@@ -62,7 +67,7 @@ def as_times(value: Any) -> FloatArray:
 
 def as_integer(name: str, value: object, min_value: int, max_value: float = np.inf) -> int:
     """Return ``value``, an int in ``min_value`` .. ``max_value``; else raises TheoryError."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+    if isinstance(value, (bool, np.timedelta64)) or not isinstance(value, (int, np.integer)):
         raise TheoryError(f"{name} must be an integer, got {value!r}")
     if not min_value <= value <= max_value:
         bound = (

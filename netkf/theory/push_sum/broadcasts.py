@@ -11,6 +11,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import ArrayLike, FloatArray
 from netkf.network.graphs import Topology
 from netkf.scenario.scenario import Scenario
+from netkf.theory.common.requirements import topology_of
 from netkf.theory.numerics.matrices import as_integer, as_numbers
 from netkf.theory.push_sum.estimation_steps import averaging_law
 
@@ -32,7 +33,7 @@ def mass_totals(
     links change, which is what paper P Remark 1 says cannot be synchronised. Raises TheoryError for
     wrong arguments.
     """
-    topology = graph.topology if isinstance(graph, Scenario) else graph
+    topology = topology_of(graph)
     links = np.array([[topology.index[a], topology.index[b]] for a, b in topology.links])
     present, N = as_numbers("up", up) != 0.0, len(topology.nodes)
     if present.ndim != 2 or present.shape[1] != len(links):

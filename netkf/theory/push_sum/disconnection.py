@@ -161,10 +161,11 @@ def _read_graph(graph: Any) -> tuple[list[Any], list[Edge], bool]:
         return list(graph.nodes), links, graph.is_directed()
     try:
         links = [(i, j) for i, j in graph]
+        nodes = list(dict.fromkeys(node for link in links for node in link))
     except (TypeError, ValueError):
         message = "graph must be a graph, a scenario or pairs of nodes"
         raise TheoryError(f"{message}, got a {type(graph).__name__}") from None
-    return list(dict.fromkeys(node for link in links for node in link)), links, False
+    return nodes, links, False
 
 
 def _link_probability(link: Edge, delivery: float | Mapping[Edge, float] | None) -> float:

@@ -11,6 +11,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, symmetric
 from netkf.network.graphs import Topology
 from netkf.scenario.scenario import Scenario
+from netkf.theory.common.requirements import topology_of
 from netkf.theory.intermittent.riccati import filtered_covariance
 
 
@@ -104,7 +105,7 @@ def consensus_gain_bound(graph: Scenario | Topology) -> GainBound:
     The largest degree of a node, or that plus one as in the push-sum paper, lies *below* rho(L) on
     every graph with a link. Raises TheoryError for directed graphs.
     """
-    topology = graph.topology if isinstance(graph, Scenario) else graph
+    topology = topology_of(graph)
     if topology.directed:
         raise TheoryError("the graph must be undirected")
     N, degrees = len(topology.nodes), topology.degrees
