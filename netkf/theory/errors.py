@@ -33,6 +33,9 @@ from netkf.theory.common.slot_columns import SlotColumns
 from netkf.theory.folders import theory_of
 from netkf.trace.run import Run
 
+IGNORED = np.errstate(over="ignore", invalid="ignore")
+"""Errors of a filter that is unstable grow until they overflow: who asks finds inf or nan."""
+
 
 class ErrorLaw(NamedTuple):
     """The Gaussian law of the errors of M estimators at T times given the events of a run.
@@ -75,6 +78,7 @@ def error_squares(scenario: Scenario, run: Run) -> FloatArray:
     return _seen_blocks(scenario, _joint_moments(scenario, run, about_mean=False))
 
 
+@IGNORED
 def error_law(scenario: Scenario, run: Run) -> ErrorLaw:
     """Return the joint Gaussian law of errors at all ``run.times`` given the events, with their
     mean, and P_i by the filter's equations; a pooled filter counts once. Raises the same errors.
@@ -101,6 +105,7 @@ def _seen_blocks(scenario: Scenario, joint: FloatArray) -> FloatArray:
     return np.where(known[:, :, None] & known[:, None, :], blocks, np.nan)
 
 
+@IGNORED
 def _joint_moments(scenario: Scenario, run: Run, about_mean: bool) -> FloatArray:
     errors = _errors_of(scenario, run)
     # The generator stops at each sample, when the errors have their values of that time.

@@ -8,6 +8,7 @@ import netkf
 from netkf import theory
 from netkf.scenario.reading import from_table
 from netkf.theory.errors import error_law
+from tests.conftest import SCENARIOS
 from tests.engines.linearity import engine_covariance, engine_joint
 
 POISSON = {"kind": "poisson", "rate": 2.0}
@@ -194,3 +195,19 @@ def test_the_joint_law_of_a_filter_without_readings_is_the_plants(tmp_path):
     C, A = theory.error_covariance(scenario, run)[:, 2], scenario.diffusion.A
     joint = law.covariance.reshape(2, 4, 2, 2, 4, 2)[:, 2, :, :, 2]
     close(joint[0, :, 1], C[0] @ scipy.linalg.expm(A * 1.1).T, 1e-10)
+
+
+GROWING = [[9.0, 1.0], [-1.0, 9.0]]
+DIVERGING = [
+    ("blind_unstable", {"plant.A": GROWING, "horizon": 100.0, "probe": 1.0}),
+    ("poisson_ring", {"plant.A": GROWING, "horizon": 100.0, "probe": 1.0}),
+    ("gossip_ring", {"plant.F": (30.0 * np.eye(4)).tolist()}),
+]
+
+
+@pytest.mark.parametrize(("name", "changes"), DIVERGING, ids=[name for name, _ in DIVERGING])
+def test_errors_that_overflow_are_infinite_without_a_warning(name, changes):
+    scenario = netkf.load(SCENARIOS / f"{name}.toml").replace(changes)
+    run = netkf.simulate(scenario)
+    assert run.status == "diverged"
+    assert not np.isfinite(theory.error_covariance(scenario, run)).all()
