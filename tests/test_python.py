@@ -234,11 +234,15 @@ def test_completion_offers_public_names_only():
         assert all(hasattr(module, name) for name in dir(module))
 
 
-@pytest.mark.parametrize("odd", [None, "x", 1j, np.eye(2), {}])
+@pytest.mark.parametrize("odd", [None, "x", 1j, [1.0]])
 def test_arguments_of_a_wrong_kind_are_one_line(odd, ring):
     calls = {
         "run": lambda: netkf.innovations(odd),
-        "engine": lambda: netkf.simulate(ring, engine=odd),
+        "run: must": lambda: netkf.held_out_errors(odd),
+        "netkf.Scenario": lambda: netkf.save(odd, odd, "saved"),
+        "directory": lambda: netkf.save(odd, ring, 1),
+        "changes": lambda: ring.replace(odd),
+        "engine": lambda: netkf.simulate(ring, engine=np.eye(2)),
         "--vary": lambda: netkf.sweep(ring, odd),
         "low": lambda: netkf.size(ring, "filter.epsilon", odd, 0.2, "worst_rms<=1"),
         "--vary: ": lambda: netkf.size(ring, odd, 0.1, 0.2, "worst_rms<=1"),

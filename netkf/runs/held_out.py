@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
+from netkf.runs.files import require_run
 from netkf.runs.readings import Readings, collect_readings
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
@@ -29,7 +30,7 @@ def held_out_errors(run: Run) -> list[dict[str, Any]]:
 
     The run is simulated again. Raises ScenarioError and EngineError.
     """
-    return errors_of_replica(run.scenario, run.seed, run.replica)
+    return errors_of_replica(require_run(run), run.seed, run.replica)
 
 
 def errors_of_replica(scenario: Scenario, seed: int, replica: int) -> list[dict[str, Any]]:

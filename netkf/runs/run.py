@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import integer
+from netkf.core.fields import as_path, integer
 from netkf.core.instants import TimeGrid
 from netkf.engines.base import Engine, Progress, silent
 from netkf.linalg import compiling
@@ -31,7 +31,7 @@ from netkf.runs.files import (
 from netkf.runs.parquet_files import ParquetSink
 from netkf.runs.provenance import machine, versions
 from netkf.runs.quantities import NetworkSink
-from netkf.runs.simulate import choose_engine
+from netkf.runs.simulate import choose_engine, require_scenario
 from netkf.runs.summary import (
     PromisedTraces,
     SummarySink,
@@ -142,12 +142,13 @@ def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
     Raises ScenarioError if the run belongs to another scenario or the directory is not empty, and
     WriteError.
     """
-    if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
+    require_scenario(scenario, "save", ", directory")
+    directory = as_path("directory", directory)
+    is_run = isinstance(run, Run)
+    if not is_run or run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
         rule = "must be a run of this scenario: its nodes or its state differ"
         raise ScenarioError("run", rule, run, "save it with the scenario it was simulated from")
-    output = _create_output(
-        scenario, Path(directory), run.seed, run.replica, run.engine, tables=True
-    )
+    output = _create_output(scenario, directory, run.seed, run.replica, run.engine, tables=True)
     for sink in output.sinks:
         sink.events(run.log)
         sink.exact_errors = run.exact_errors

@@ -55,10 +55,13 @@ NOT_IMPORTED = object()
 S = TypeVar("S", bound=DerivedScenario)
 
 
-def change_keys(scenario: S, changes: Mapping[str, Any]) -> S:
-    """Return a scenario with values at key paths changed; files and modules are looked up in the
-    folder of its file, or else of its first data file, or the current one.
+def change_keys(scenario: S, changes: Any) -> S:
+    """Return a scenario with ``changes``, values by key path; files and modules are looked up in
+    the folder of its file, or else of its first data file, or the current one.
     """
+    if not isinstance(changes, Mapping):
+        rule, remedy = "must be values by key", "write {'network.activation.rate': 5.0}"
+        raise ScenarioError("changes", rule, changes, remedy)
     folder = getattr(scenario, "_folder", None)
     if folder is None:
         folder = next((s.folder for s in source_files(scenario)), Path.cwd())
