@@ -40,6 +40,8 @@ RANGE = 30.0
 """Largest change of the logarithm of a variance that is searched."""
 NEGLIGIBLE = 1e-6
 """Loss of log-likelihood below which a variance is 0 as far as the readings can tell."""
+UNKNOWN = 10.0
+"""Standard error of the logarithm of a variance from which on it is unknown."""
 STARTS = (0.0, -4.0, 4.0)
 """Changes of the logarithms of the variances of plant and sensors that are tried at first."""
 
@@ -344,15 +346,18 @@ def fit_noise(
     start = max(shifts, key=lambda theta: model.value(np.exp(theta)))
     best = _climb(model.value, start)
     factors, free = np.exp(best), np.ones(count, dtype=bool)
-    top = model.value(factors)
-    for k in range(count):
-        without = np.where(np.arange(count) == k, 0.0, factors)
-        if model.value(without) >= top - NEGLIGIBLE:
-            free[k] = False
+    top, zero = model.value(factors), list[str]()
+    for k, one in enumerate(model.variances):
+        without, more = (np.where(np.arange(count) == k, f * factors, factors) for f in (0, 100))
+        free[k] = model.value(without) < top - NEGLIGIBLE
+        if not free[k] and model.value(more) >= top - NEGLIGIBLE:
+            factors[k] = 1.0  # readings say nothing of it
+        elif not free[k]:
+            zero.append(one.name)
             # Filters need some noise of every reading.
             factors = without if k < plant else factors
     deviations = _deviations(model.value, factors, free)
-    return _make_fit(scenario, model, factors, deviations, confidence)
+    return _make_fit(scenario, model, factors, deviations, zero, confidence)
 
 
 def _climb(value: Callable[[FloatArray], float], start: FloatArray) -> FloatArray:
@@ -395,7 +400,9 @@ def _hessian(loss: Callable[[FloatArray], float], theta: FloatArray) -> FloatArr
 def _deviations(
     value: Callable[[FloatArray], float], factors: FloatArray, free: np.ndarray
 ) -> FloatArray:
-    """Return standard errors (J,) of logarithms of factors, nan for those that are not ``free``."""
+    """Return standard errors (J,) of logarithms of factors, nan for those that are not ``free`` or
+    that readings do not tell, as two that act alike.
+    """
 
     def loss(theta: FloatArray) -> float:
         whole = factors.copy()
@@ -404,9 +411,10 @@ def _deviations(
 
     deviations = np.full(len(factors), math.nan)
     if free.any():
-        curvature = _hessian(loss, np.log(factors[free]))
-        with np.errstate(invalid="ignore"):
-            deviations[free] = np.sqrt(np.diag(np.linalg.pinv(curvature)))
+        values, vectors = np.linalg.eigh(_hessian(loss, np.log(factors[free])))
+        # Less curvature than that is rounding.
+        deviations[free] = np.sqrt((vectors**2 / np.maximum(values, UNKNOWN**-4)).sum(axis=1))
+        deviations[deviations > UNKNOWN] = math.nan
     return deviations
 
 
@@ -415,6 +423,7 @@ def _make_fit(
     model: CentralModel,
     factors: FloatArray,
     deviations: FloatArray,
+    zero: list[str],
     confidence: float,
 ) -> NoiseFit:
     import pandas as pd
@@ -433,8 +442,13 @@ def _make_fit(
         }
     )
     changes = _changes(scenario, model.variances, factors)
-    zero = [v.name for v, one in zip(model.variances, deviations, strict=True) if np.isnan(one)]
-    notes = (f"as far as these readings tell, 0: {', '.join(zero)}",) if zero else ()
+    pairs = zip(table["name"], np.isnan(deviations), strict=True)
+    unknown = [name for name, is_unknown in pairs if is_unknown and name not in zero]
+    said = {
+        "as far as these readings tell, 0": zero,
+        "these readings do not tell, by itself or apart from others": unknown,
+    }
+    notes = tuple(f"{words}: {', '.join(names)}" for words, names in said.items() if names)
     return NoiseFit(
         scenario.name,
         table,

@@ -214,3 +214,31 @@ def test_a_sensor_without_noise_keeps_a_little(tmp_path):
     assert 0.0 < found.table["value"][1] < 1e-3
     assert found.table["value"][0] == pytest.approx(1.0, rel=0.5)
     assert np.isfinite(netkf.simulate(found.scenario, engine="simpy").xhat).all()
+
+
+@pytest.mark.parametrize(
+    ("plant", "H", "unknown", "told"),
+    [
+        # Two noises that act alike; all that is read is Q + R; two modes of one sum; one unseen.
+        ({"kind": "diffusion", "A": [[-0.3]], "B": [[1.0, 1.0]]}, [[1.0]], [0, 1], [2]),
+        ({"F": [[0.0]], "Q": [[1.0]]}, [[1.0]], [0, 1], []),
+        ({"F": [[0.5, 0], [0, 0.5]], "Q": [[1.0, 0], [0, 1.0]]}, [[1.0, 1.0]], [0, 1], [2]),
+        ({"F": [[0.5, 0], [0, 0.5]], "Q": [[1.0, 0], [0, 1.0]]}, [[1.0, 0.0]], [1], [0]),
+    ],
+)
+def test_what_readings_do_not_tell_has_no_interval_and_is_not_called_zero(
+    tmp_path, plant, H, unknown, told
+):
+    sensor = {"H": H, "R": [[0.2]]}
+    if "A" in plant:
+        sensor["sampling"] = {"kind": "periodic", "period": 0.5}
+    else:
+        plant = {"kind": "linear", "period": 1.0, **plant}
+    found = fit_noise(scenario(tmp_path, plant, sensor, 200.0))
+    rows = found.table.iloc[unknown]
+    assert rows[["se", "low", "high"]].isna().all(axis=None)
+    assert (rows["value"] > 0.01).all()
+    assert found.notes[-1].endswith(": " + ", ".join(rows["name"]))
+    assert np.isfinite(found.table.iloc[told]["se"]).all()
+    if unknown == [1]:  # the scenario's
+        assert rows["value"].item() == 1.0
