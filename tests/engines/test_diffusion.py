@@ -326,6 +326,17 @@ def test_the_normalised_outer_product_of_gaussians(seed):
     )
 
 
+@pytest.mark.parametrize("size", [1.0, 1e3, 1e6, 1e10, 1e100])
+def test_the_normalised_outer_product_holds_for_regressors_in_any_unit(size):
+    fixed = normalised_outer(np.array([[size]]), np.zeros((1, 1))).item()
+    assert fixed == pytest.approx(1.0 / (1.0 + size**-2), rel=1e-13)
+    # 1 - E[1 / (1 + (size z)^2)], z standard normal, is an error function.
+    s = 1.0 / size
+    expected = 1.0 - np.sqrt(np.pi / 2.0) * s * scipy.special.erfcx(s / np.sqrt(2.0))
+    drawn = normalised_outer(np.zeros((1, 1)), np.array([[size**2]])).item()
+    assert drawn == pytest.approx(expected, rel=1e-11)
+
+
 @pytest.mark.slow
 def test_information_level_of_section_vi():
     """D (19) for every past; numbers measured independently. No sensor alone excites."""

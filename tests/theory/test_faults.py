@@ -121,6 +121,16 @@ def test_an_outlier_is_refused_with_the_probability_of_its_spread(scenario_of):
         ),
         ('{ kind = "stuck", since = 3.0 }', GATE, "stuck readings is not known beforehand"),
         ('{ kind = "outliers", probability = 0.1, sigma = 9.0 }', GATE, "refuses an outlier with"),
+        (
+            '{ kind = "biased", size = 9.0, since = 3.1, until = 3.2 }',
+            GATE,
+            "reading while it is bad (biased)",
+        ),
+        (
+            '{ kind = "outliers", probability = 1.0, sigma = 9.0, since = 3.1, until = 3.2 }',
+            GATE,
+            "reading while it is bad (outliers)",
+        ),
         ('{ kind = "stuck" }', "", "no gate refuses their readings"),
     ],
 )

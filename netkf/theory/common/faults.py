@@ -59,6 +59,8 @@ def refusals(scenario: Scenario, node: int, placed: PlacedSensor) -> Refusals | 
     count = min(int(scenario.horizon / step) + 1, MAX_READINGS)
     times = np.asarray(step * np.arange(first, first + count), dtype=np.float64)
     times = times[[fault.holds(time) and time < scenario.horizon for time in times.tolist()]]
+    if not len(times):
+        return Refusals(times, times, times)
     alone = _alone(scenario, sensor.matrix_of(scenario.plant.n), R, step)
     if isinstance(fault, Outliers):
         values = [np.nan if alone is None else _of_outliers(gate, fault, alone.S)]
@@ -143,6 +145,8 @@ def _about(fault: Fault, found: Refusals | None, gate: Gate) -> str:
     name = type(fault).__name__.lower()
     if found is None:
         return f"how often the gate refuses {name} readings is not known beforehand"
+    if not len(found.times):
+        return f"the sensor takes no reading while it is bad ({name})"
     first, last = (
         f"{'0' if np.isnan(found.alone[k]) else f'{found.alone[k]:.3g}'} to {found.knowing[k]:.3g}"
         for k in (0, -1)

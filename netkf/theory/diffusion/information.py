@@ -25,11 +25,11 @@ from netkf.theory.numerics.matrices import as_integer, as_number
 if TYPE_CHECKING:
     import pandas as pd
 
-# Trapezoidal rule in log u for the integral of f(u) exp(-u) over u > 0. Outside of these limits
-# lies less than rounding: u exp(-u) is 4e-18 at the lower one and 1e-17 at the upper one.
-_STEP = 0.25
-_U = np.exp(np.arange(-40.0, 4.0, _STEP))
-_WEIGHTS = _STEP * _U * np.exp(-_U)
+STEP, LOWER, UPPER = 0.25, -40.0, 4.0
+"""Trapezoidal rule in log u for the integral of f(u) exp(-u) over u > 0. Outside of these limits
+lies less than rounding: u exp(-u) is 4e-18 at the lower one and 1e-17 at the upper one. Where
+|phi| is large f falls from u = 1 / |phi|^2 on, and the lower one is so much lower.
+"""
 EIGENVALUE_TOLERANCE = 1e-12  # relative to the trace; smaller eigenvalues count as 0
 MAX_SEARCHED = 30  # entries of a past up to which the worst one is searched for
 MAX_EVALUATIONS = 300  # of the level, by one search from one start
@@ -248,10 +248,12 @@ def normalised_outer(mean: FloatArray, cov: FloatArray) -> FloatArray:
     spread = np.maximum(spread, 0.0)
     # In the axes of the covariance the entries of phi are independent.
     m = mean @ axes
+    size = np.log1p((m * m).sum(axis=1).max(initial=0.0) + spread.sum())
+    u = np.exp(np.arange(LOWER - np.ceil(size), UPPER, STEP))
     # In the axes of cov, exp(-u |phi|^2) divides means and variances by D.
-    D = 1.0 + 2.0 * _U[:, None] * spread
-    decay = np.exp(-_U * np.einsum("ka,ua->ku", m * m, 1.0 / D))
-    weights = _WEIGHTS / np.sqrt(D.prod(axis=1)) * decay
+    D = 1.0 + 2.0 * u[:, None] * spread
+    decay = np.exp(-u * np.einsum("ka,ua->ku", m * m, 1.0 / D))
+    weights = STEP * u * np.exp(-u) / np.sqrt(D.prod(axis=1)) * decay
     shrunk = np.einsum("ku,ua,ub->kab", weights, 1.0 / D, 1.0 / D) * m[:, :, None] * m[:, None, :]
     indices = np.arange(len(cov))
     shrunk[:, indices, indices] += np.einsum("ku,ua->ka", weights, spread / D)
