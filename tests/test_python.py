@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 import netkf
+from netkf import theory
 from netkf.ensembles.blocks import pack_scenario
 from netkf.runs.run import run_to_directory
 
@@ -89,9 +90,10 @@ def test_a_saved_run_is_what_netkf_run_writes(ring, tmp_path):
             assert file.read_bytes() == (saved / file.name).read_bytes(), file.name
     with pytest.raises(netkf.ScenarioError, match="new or empty directory"):
         netkf.save(netkf.simulate(ring), ring, saved)
-    other = ring.replace({"network.graph.nodes": 5})
-    with pytest.raises(netkf.ScenarioError, match="its nodes or its state differ"):
-        netkf.save(netkf.simulate(ring), other, tmp_path / "other")
+    for change in ({"network.graph.nodes": 5}, {"filter.epsilon": 0.11}):
+        other = ring.replace(change)
+        with pytest.raises(netkf.ScenarioError, match="their keys or files differ"):
+            netkf.save(netkf.simulate(ring), other, tmp_path / "other")
     assert not (tmp_path / "other").exists()
 
 
@@ -234,14 +236,22 @@ def test_completion_offers_public_names_only():
         assert all(hasattr(module, name) for name in dir(module))
 
 
-@pytest.mark.parametrize("odd", [None, "x", 1j, [1.0]])
+@pytest.mark.parametrize("odd", [None, "x", 1j, [1.0], np.eye(2)])
 def test_arguments_of_a_wrong_kind_are_one_line(odd, ring):
+    run, planar = netkf.simulate(ring), netkf.load("scenarios/push_sum_planar.toml")
     calls = {
         "run": lambda: netkf.innovations(odd),
         "run: must": lambda: netkf.held_out_errors(odd),
         "netkf.Scenario": lambda: netkf.save(odd, odd, "saved"),
         "directory": lambda: netkf.save(odd, ring, 1),
         "changes": lambda: ring.replace(odd),
+        "runs": lambda: netkf.monte_carlo(ring, odd),
+        "kind": lambda: run.count(odd),
+        "figure": lambda: run.plot(odd),
+        "name": lambda: run.block(odd, 0),
+        "trust": lambda: netkf.load("scenarios/poisson_ring.toml", trust=odd),
+        "stacked": lambda: theory.error_covariance(ring, run, stacked=odd),
+        "moment": lambda: theory.exact_minimum_gamma(planar, odd),
         "engine": lambda: netkf.simulate(ring, engine=np.eye(2)),
         "--vary": lambda: netkf.sweep(ring, odd),
         "low": lambda: netkf.size(ring, "filter.epsilon", odd, 0.2, "worst_rms<=1"),
@@ -251,3 +261,18 @@ def test_arguments_of_a_wrong_kind_are_one_line(odd, ring):
         with pytest.raises(netkf.NetkfError, match=name) as caught:
             call()
         assert "\n" not in str(caught.value)
+
+
+def test_numbers_too_large_are_one_line(ring):
+    drawn, large = netkf.load("scenarios/diffusion_regression.toml"), 10**30
+    calls = {
+        "runs: must": lambda: netkf.monte_carlo(ring, large),
+        "runs: must be": lambda: netkf.check(ring, large),
+        "runs: must be an": lambda: netkf.sweep(ring, {"filter.epsilon": [0.1]}, runs=large),
+        "runs must": lambda: theory.information_level(drawn, runs=large),
+        "overflows": lambda: theory.constant_gain_bound(ring, 1e308),
+        "nan": lambda: theory.disconnection_probability([(1, np.nan), (0, 1)], 0.5),
+    }
+    for words, call in calls.items():
+        with pytest.raises(netkf.NetkfError, match=words):
+            call()

@@ -49,7 +49,7 @@ from netkf.checks.results import RESULTS_FORM, ReplicaResult
 from netkf.checks.rounding import EPS, OPERATIONS
 from netkf.checks.samples import stack_summaries
 from netkf.core.errors import ScenarioError, TheoryError
-from netkf.core.fields import integer, number
+from netkf.core.fields import integer, number, require_runs
 from netkf.core.notebook import NotebookTable
 from netkf.engines.base import Engine
 from netkf.engines.simpy.engine import SimpyEngine
@@ -383,7 +383,7 @@ def check(
     Raises TheoryError if nothing is promised, ScenarioError for bad arguments.
     """
     require_scenario(scenario, "check")
-    count = integer(low=MIN_RUNS)("runs", runs)
+    count = require_runs(runs, MIN_RUNS)
     confident = number(above=0.0, below=1.0)("confidence", confidence)
     root = scenario.seed if seed is None else integer(low=0)("seed", seed)
     if until not in (None, "decided"):
@@ -391,7 +391,7 @@ def check(
     _require_earlier(scenario, earlier, root, count)
     _require_laws(scenario)
     chosen = with_check_times(scenario)
-    verdict, last = earlier, max(count, most if until else count)
+    verdict, last = earlier, max(count, require_runs(most, key="most") if until else count)
     with make_pool(last, PoolOptions(workers, executor, scheduler), open_ended=True) as pool:
         while True:
             results = list(verdict.results) if verdict is not None else []

@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 from netkf.core.errors import quote
-from netkf.core.printable import MAX_NAME
+from netkf.core.printable import MAX_NAME, MAX_RUNS
 from netkf.figures.names import FIGURE_NAMES, FIT_FIGURES, FORMATS
 
 ENGINES = ("auto", "simpy", "processes", "compiled")
-MAX_RUNS = 100_000_000  # larger numbers are typing errors
 ONE_THREAD = ("check", "work", "merge")
 """Commands whose last digits must not depend on whether a run is simulated here or in a worker
 process, whose LAPACK has one thread.

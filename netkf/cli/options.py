@@ -46,7 +46,12 @@ def parse_changes(settings: Sequence[str]) -> dict[str, Any]:
     from netkf.scenario.values import parse_value, split_setting
 
     pairs = [split_setting("--set", setting) for setting in settings]
-    return {key: parse_value("--set", key, text) for key, text in pairs}
+    changes: dict[str, Any] = {}
+    for key, text in pairs:
+        if key in changes:
+            raise ScenarioError("--set", f"gives {key} twice", text, "give each key once")
+        changes[key] = parse_value("--set", key, text)
+    return changes
 
 
 def load_scenario(
@@ -68,9 +73,9 @@ def load_scenario(
 
     if copy is not None:  # that of a plan, with all changes
         return load(copy, trust=options.trust)
-    changes = {**parse_changes(options.set), **ignored}
-    if getattr(options, "seed", None) is not None:
-        changes["seed"] = options.seed
+    seed = getattr(options, "seed", None)
+    settings = options.set if seed is None else [*options.set, f"seed={seed}"]
+    changes = {**parse_changes(settings), **ignored}
     loaded = load(options.scenario, changes, trust=options.trust)
     options.loaded = loaded
     return loaded

@@ -27,7 +27,7 @@ from netkf.core.contracts import (
 )
 from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.instants import as_written
-from netkf.core.printable import MAX_NAME
+from netkf.core.printable import MAX_NAME, MAX_RUNS
 from netkf.core.stamps import TimeBase
 from netkf.linalg.arrays import FloatArray, is_semidefinite, readonly_array
 
@@ -296,6 +296,12 @@ def integer(low: int | None = None, high: int | None = None) -> Rule:
     limits = {"minimum": low, "maximum": high}
     schema = {"type": "integer", **{k: v for k, v in limits.items() if v is not None}}
     return Rule(f"must be an integer{bounds}", convert, f"give an integer{bounds}", schema)
+
+
+def require_runs(runs: object, low: int = 1, key: str = "runs") -> int:
+    """Return a number of ``runs``, from ``low`` to MAX_RUNS; raises ScenarioError at ``key``."""
+    result: int = integer(low, MAX_RUNS)(key, runs)
+    return result
 
 
 MAX_MAGNITUDE = 1e30

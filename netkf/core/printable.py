@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 MAX_NAME = 200
 """Longest name of a node, in characters."""
+MAX_RUNS = 100_000_000
+"""Most runs or draws: larger numbers are typing errors."""
 
 
 class NamedNode(int):

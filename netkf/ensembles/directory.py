@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from netkf.core.errors import WriteError
-from netkf.core.fields import integer, one_of
+from netkf.core.fields import one_of, require_runs
 from netkf.core.interrupts import writing_at_last
 from netkf.engines.base import Engine
 from netkf.ensembles.block_files import RunIdentity
@@ -104,7 +104,7 @@ def runs_to_directory(
     if a plugged-in class fails, and InterruptedRunError (a KeyboardInterrupt) when interrupted.
     """
     started = time.perf_counter()
-    runs = integer(low=1)("runs", runs)
+    runs = require_runs(runs)
     one_of(*TRACES)("trace", options.trace)
     engine_used = choose_engine(options.engine, scenario, announce=False)
     check_sources(scenario)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from netkf.core.fields import integer
+from netkf.core.fields import require_runs
 from netkf.core.notebook import NotebookTable
 from netkf.core.wings import WINGS
 from netkf.ensembles.pools import PoolOptions
@@ -131,7 +131,7 @@ def monte_carlo(
     """
     require_scenario(scenario, "monte_carlo", ", runs")
     chosen = choose_engine(engine, scenario)
-    seed, count = scenario.seed if seed is None else seed, integer(low=1)("runs", runs)
+    seed, count = scenario.seed if seed is None else seed, require_runs(runs)
     statistics = replicate_blocks(
         partial(block_statistics, engine=chosen),
         merge,

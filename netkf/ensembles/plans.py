@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import integer, one_of
+from netkf.core.fields import one_of, require_runs
 from netkf.ensembles.block_files import RunIdentity
 from netkf.ensembles.checkpoints import BlockCheckpoints
 from netkf.ensembles.directory import (
@@ -65,7 +65,7 @@ def plan_ensemble(
 
     Raises ScenarioError and EngineError before anything is written, and WriteError.
     """
-    runs = integer(low=1)("runs", runs)
+    runs = require_runs(runs)
     one_of(*TRACES)("trace", options.trace)
     engine = choose_engine(options.engine, scenario, announce=False)
     check_sources(scenario)

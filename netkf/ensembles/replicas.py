@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from netkf.core.errors import EngineError, NetkfError, ScenarioError
-from netkf.core.fields import integer
+from netkf.core.fields import integer, require_runs
 from netkf.ensembles.blocks import BlockResult, BlockTask, Job, Task, each_replica
 from netkf.ensembles.merge_tree import Merge, MergeTree
 from netkf.ensembles.pool import Pool
@@ -151,7 +151,7 @@ def replicate_blocks(
     if not isinstance(scenario, Scenario):
         raise ScenarioError("", "must be a netkf.Scenario", scenario, "netkf.load(path) gives one")
     seed = scenario.seed if seed is None else integer(low=0)("seed", seed)
-    runs, first = integer(low=1)("runs", runs), integer(low=0)("first", first)
+    runs, first = require_runs(runs), integer(low=0)("first", first)
     runs_done = 0
     job = Job(scenario, task, seed, first, start=0, stop=runs, size=1)
 

@@ -24,7 +24,9 @@ from netkf.runs.failures import explain_failure
 from netkf.runs.files import (
     check_sources,
     create_output_directory,
+    require_run,
     run_file_names,
+    scenario_digest,
     write_json,
     write_scenario,
 )
@@ -144,10 +146,10 @@ def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
     """
     require_scenario(scenario, "save", ", directory")
     directory = as_path("directory", directory)
-    is_run = isinstance(run, Run)
-    if not is_run or run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
-        rule = "must be a run of this scenario: its nodes or its state differ"
-        raise ScenarioError("run", rule, run, "save it with the scenario it was simulated from")
+    known = require_run(run)
+    if known is not scenario and scenario_digest(known) != scenario_digest(scenario):
+        rule = "must be a run of this scenario: their keys or files differ"
+        raise ScenarioError("run", rule, run, "save it with run.scenario")
     output = _create_output(scenario, directory, run.seed, run.replica, run.engine, tables=True)
     for sink in output.sinks:
         sink.events(run.log)

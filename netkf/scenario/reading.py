@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import as_path
+from netkf.core.fields import as_path, boolean
 from netkf.scenario.imports import Origin
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import MAX_DEPTH, build_scenario, change_table, explain_left_over
@@ -62,7 +62,7 @@ def require_changes(changes: object) -> Mapping[str, Any]:
 
 def from_table(table: Mapping[str, Any], folder: Path, trust: bool = True) -> Scenario:
     """Return a scenario from the tables of a file that lies in ``folder``, see :func:`load`."""
-    return build_scenario(Scenario, table, Origin(folder, trust))
+    return build_scenario(Scenario, table, Origin(folder, boolean("trust", trust)))
 
 
 def _parse_file(path: Path) -> dict[str, Any]:
@@ -71,8 +71,9 @@ def _parse_file(path: Path) -> dict[str, Any]:
     except UnicodeDecodeError:
         raise ScenarioError("", "is not UTF-8 text", None, "save it as UTF-8") from None
     except OSError as error:
-        rule = f"cannot be read ({error.strerror})"
-        raise ScenarioError("", rule, None, "check the path") from None
+        rule, inside = f"cannot be read ({error.strerror})", path / "scenario.toml"
+        remedy = f"give {inside}" if os.path.isfile(inside) else "check the path"
+        raise ScenarioError("", rule, None, remedy) from None
     except RecursionError:
         rule = "is not valid TOML: nested too deep"
         raise ScenarioError("", rule, None, "correct the brackets") from None

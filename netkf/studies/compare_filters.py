@@ -15,7 +15,7 @@ import numpy as np
 
 from netkf.algorithms.filter import Filter
 from netkf.core.errors import EngineError, ScenarioError, suggest_nearest
-from netkf.core.fields import integer, number
+from netkf.core.fields import integer, number, require_runs
 from netkf.core.notebook import NotebookTable
 from netkf.core.printable import one_line, shorten
 from netkf.ensembles.pool import Pool
@@ -200,7 +200,7 @@ def compare_filters(
     """
     require_scenario(scenario, "compare_filters", ", ...")
     confidence = number(above=0.0, below=1.0)("confidence", confidence)
-    count = integer(low=1)("runs", runs)
+    count = require_runs(runs)
     root = scenario.seed if seed is None else integer(low=0)("seed", seed)
     entries = _candidates(scenario, filters, engine)
     able = [entry for entry in entries if entry.scenario is not None]

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from netkf.core.errors import ScenarioError, TheoryError
-from netkf.core.fields import integer, number
+from netkf.core.fields import number, require_runs
 from netkf.core.notebook import NotebookTable
 from netkf.engines.base import Engine
 from netkf.ensembles.pools import PoolOptions
@@ -363,7 +363,7 @@ def consistency(
             "simulate the plant and all readings, or use netkf innovations, which needs no truth"
         )
         raise ScenarioError("plant", rule, None, remedy)
-    count = integer(low=MIN_RUNS)("runs", runs)
+    count = require_runs(runs, MIN_RUNS)
     confidence = number(above=0.0, below=1.0)("confidence", confidence)
     task = partial(run_consistency, engine=choose_engine(engine, scenario))
     pool = PoolOptions(workers, executor, scheduler)

@@ -9,7 +9,7 @@ from concurrent.futures import Executor
 from functools import partial
 
 from netkf.core.errors import ScenarioError, TheoryError
-from netkf.core.fields import integer, number, one_of
+from netkf.core.fields import number, one_of, require_runs
 from netkf.ensembles.blocks import BlockTask, each_replica
 from netkf.ensembles.pools import PoolOptions, make_pool
 from netkf.runs.simulate import choose_engine, require_scenario
@@ -72,7 +72,7 @@ def size(
         one_of("theory", "simulation")("--by", by)
     parsed = parse_target(target)
     confidence = number(above=0.0, below=1.0)("--confidence", confidence)
-    integer(low=FIRST_BATCH)("--runs", runs)
+    require_runs(runs, FIRST_BATCH, "--runs")
     if parsed.of_errors and not scenario.plant.truth_known:
         rule = "is about errors, and there is no ground truth"
         raise ScenarioError("--target", rule, target, "ask for mean_trace or worst_trace")

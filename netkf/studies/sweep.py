@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from netkf.core.errors import TheoryError
-from netkf.core.fields import integer
+from netkf.core.fields import require_runs
 from netkf.ensembles.pool import Pool
 from netkf.ensembles.pools import ANYWHERE, PoolOptions, make_pool
 from netkf.ensembles.replicas import replicate_blocks, results_of
@@ -113,7 +113,7 @@ def plan_sweep(
 ) -> SweepPlan:
     """Return the plan of a sweep, all points of which can run; raises ScenarioError."""
     require_scenario(scenario, "sweep", ", ...")
-    integer(low=1)("runs", runs)
+    require_runs(runs)
     base = scenario if seed is None else scenario.replace({"seed": seed})
     points = expand_grid(base, vary)
     for point in points:

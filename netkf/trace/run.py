@@ -11,6 +11,7 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError, errors_under, quote
 from netkf.core.extras import require
+from netkf.core.fields import one_of, text
 from netkf.core.notebook import NotebookTable
 from netkf.core.wings import WINGS
 from netkf.linalg.arrays import FloatArray
@@ -178,7 +179,7 @@ class Run(NotebookTable):
                     key, "must be a node of the run", one, "give another id or name"
                 )
         with errors_under("name"):
-            place = self.scenario.layout.require(name, ids["node"])
+            place = self.scenario.layout.require(text("", name), ids["node"])
         k, first = self.nodes.index(ids["by"]), place.first
         if self.scenario.views is not None:
             found = np.flatnonzero(self.scenario.views[k] == first)
@@ -196,8 +197,8 @@ class Run(NotebookTable):
         )
 
     def count(self, kind: str) -> int:
-        """Return the number of events of a kind."""
-        return int((self.log["kind"] == CODES[kind]).sum())
+        """Return the number of events of a kind; raises ScenarioError for another word."""
+        return int((self.log["kind"] == CODES[one_of(*KINDS)("kind", kind)]).sum())
 
 
 class BlockSamples(NamedTuple):
@@ -217,7 +218,7 @@ def plot_by_name(result: Any, figure: str) -> Any:
     and without matplotlib.
     """
     require("matplotlib", "plot", "plot")
-    return WINGS.draw(result, figure)
+    return WINGS.draw(result, text("figure", figure))
 
 
 def _categorical(codes: np.ndarray) -> Any:

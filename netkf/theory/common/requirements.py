@@ -7,6 +7,8 @@ from collections.abc import Callable
 from functools import wraps
 from typing import Any
 
+import numpy as np
+
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.network.graphs import Topology
 from netkf.scenario.scenario import Scenario
@@ -59,7 +61,9 @@ def scenario_of_estimates(scenario: Scenario) -> Scenario:
 
 
 def _check_first_argument(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return ``function`` with a check that its first argument is a Scenario."""
+    """Return ``function`` with a check of its first argument, a Scenario, and of its flags."""
+    signature = inspect.signature(function)
+    flags = {key for key, entry in signature.parameters.items() if entry.annotation == "bool"}
 
     @wraps(function)
     def checked(scenario: Any, *args: Any, **kwargs: Any) -> Any:
@@ -69,6 +73,10 @@ def _check_first_argument(name: str, function: Callable[..., Any]) -> Callable[.
             raise ScenarioError("", f"theory.{name} takes a netkf.Scenario", scenario, remedy)
         if name not in OF_BLOCKS:
             scenario = scenario_of_estimates(scenario)
+        given = signature.bind(scenario, *args, **kwargs).arguments
+        for key in flags & given.keys():
+            if not isinstance(given[key], (bool, np.bool_)):
+                raise TheoryError(f"{key} must be True or False, got {given[key]!r}")
         return function(scenario if name in WITH_TIME else scenario.last_piece, *args, **kwargs)
 
     # Pickle finds a function by these two names: the wrapper replaces the original under them.

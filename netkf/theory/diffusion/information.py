@@ -60,7 +60,7 @@ def information_level(
     """
     import pandas as pd
 
-    runs, seed = as_integer("runs", runs, 2), as_integer("seed", seed, 0)
+    runs, seed = as_integer("runs", runs, 2), as_integer("seed", seed, 0, np.inf)
     window = None if window is None else as_integer("window", window, 1)
     sources = _make_sources(scenario)
     # States of each source (runs, m) at random slots, the same for all.
@@ -289,7 +289,7 @@ def tracking_level(
     p, beta = as_number("p", p), as_number("beta", beta)
     if not p >= 1.0 or not beta > 2.0:
         raise TheoryError(f"D (29) needs p >= 1 and beta > 2, got {p!r} and {beta!r}")
-    samples, seed = as_integer("samples", samples, 100), as_integer("seed", seed, 0)
+    samples, seed = as_integer("samples", samples, 100), as_integer("seed", seed, 0, np.inf)
     xi = _draw_noises(scenario, samples, Streams(seed).generator("noises"))
     powers = (xi * np.log(math.e + xi) ** beta) ** p
     mean, error = float(powers.mean()), QUANTILE * float(powers.std(ddof=1)) / math.sqrt(samples)

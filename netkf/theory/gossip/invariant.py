@@ -46,7 +46,7 @@ def switched_samples(scenario: Scenario, samples: int, seed: int) -> SwitchedSam
     matching = effective_matching(scenario)
     if not period_of(matching):
         raise TheoryError("G C.1 fails: Abar is not irreducible, so that nodes have different laws")
-    samples, seed = as_integer("samples", samples, 1), as_integer("seed", seed, 0)
+    samples, seed = as_integer("samples", samples, 1), as_integer("seed", seed, 0, np.inf)
     F, Q = scenario.slot_belief
     n, N = len(F), len(scenario.nodes)
     modes = reading_modes([(model.H, model.R) for model in scenario.slot_models], n)

@@ -53,9 +53,12 @@ def constant_gain_bound(
     y, bounds = np.append(packed.start.reshape(-1), 1.0), []
     for gap in np.diff(moments, prepend=0.0):
         if all_times.shape[0] <= MAX_DENSE:
-            y = scipy.linalg.expm(all_times.toarray() * gap) @ y
+            with np.errstate(over="ignore", invalid="ignore"):
+                y = scipy.linalg.expm(all_times.toarray() * gap) @ y
         elif gap > 0.0:
             y = scipy.sparse.linalg.expm_multiply(all_times * gap, y)
+        if not np.isfinite(y).all():
+            raise TheoryError(f"the bound overflows within {gap:g} s: give earlier times")
         bounds.append(packed.unpack(y[:-1].reshape(constant.shape)))
     return np.array(bounds)
 

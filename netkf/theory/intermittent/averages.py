@@ -67,7 +67,7 @@ def path_average(
     TheoryError for wrong arguments or if P* does not exist.
     """
     system, g = check_system(F, Q, H, R), check_delivery(delivery)
-    slots, seed = as_integer("slots", slots, BATCHES), as_integer("seed", seed, 0)
+    slots, seed = as_integer("slots", slots, BATCHES), as_integer("seed", seed, 0, np.inf)
     n = len(system.F)
     P = steady_covariance(*system) if start is None else as_covariance("start", start, n)
     arrived = Streams(seed).generator("arrivals").random(slots) < g

@@ -414,7 +414,7 @@ def invariant_samples(
     """
     F, Q, H, R = check_system(F, Q, H, R)
     delivery = check_delivery(delivery)
-    samples, seed = as_integer("samples", samples, 1), as_integer("seed", seed, 0)
+    samples, seed = as_integer("samples", samples, 1), as_integer("seed", seed, 0, np.inf)
     n, P = len(F), steady_covariance(F, Q, H, R)
     random = Streams(seed).generator("arrivals")
     modes = reading_modes([(H[:0], R[:0, :0]), (H, R)], n)

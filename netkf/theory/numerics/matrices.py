@@ -12,6 +12,7 @@ import scipy
 from netkf.algorithms.kernels.riccati import move_covariances
 from netkf.algorithms.kernels.riccati import riccati_flow as flow_over
 from netkf.core.errors import TheoryError
+from netkf.core.printable import MAX_RUNS
 from netkf.linalg.arrays import (
     ArrayLike,
     FloatArray,
@@ -65,17 +66,13 @@ def as_times(value: Any) -> FloatArray:
     return times
 
 
-def as_integer(name: str, value: object, min_value: int, max_value: float = np.inf) -> int:
+def as_integer(name: str, value: object, min_value: int, max_value: float = MAX_RUNS) -> int:
     """Return ``value``, an int in ``min_value`` .. ``max_value``; else raises TheoryError."""
     if isinstance(value, (bool, np.timedelta64)) or not isinstance(value, (int, np.integer)):
         raise TheoryError(f"{name} must be an integer, got {value!r}")
     if not min_value <= value <= max_value:
-        bound = (
-            f"at least {min_value}"
-            if max_value == np.inf
-            else f"an integer from {min_value} to {max_value:g}"
-        )
-        raise TheoryError(f"{name} must be {bound}, got {value!r}")
+        most = f" and at most {max_value:,}" if max_value < np.inf else ""
+        raise TheoryError(f"{name} must be at least {min_value}{most}, got {value!r}")
     return int(value)
 
 

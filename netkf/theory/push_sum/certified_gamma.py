@@ -159,7 +159,7 @@ def corollary_2(scenario: Scenario, sharp: bool = False) -> CorollaryTwo:
 
 
 def _check_moment(moment: str) -> Moment:
-    if moment not in ("mean", "mean-square"):
+    if str(moment) not in ("mean", "mean-square"):
         raise TheoryError(f'moment must be "mean" or "mean-square", got {moment!r}')
     return "mean" if moment == "mean" else "mean-square"
 

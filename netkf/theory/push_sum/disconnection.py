@@ -81,7 +81,7 @@ def disconnection_probability(
     seconds). Raises TheoryError for directed graphs, and for links without a probability or with
     one outside [0, 1].
     """
-    seed = as_integer("seed", seed, 0)
+    seed = as_integer("seed", seed, 0, np.inf)
     samples = None if samples is None else as_integer("samples", samples, 1)
     if isinstance(graph, Scenario) and delivery is None:
         return _scenario_probability(graph, seed, samples)
@@ -145,6 +145,8 @@ def _nodes_and_links(graph: Any) -> tuple[list[Any], list[Edge]]:
         raise TheoryError("the graph must be undirected")
     if not names:
         raise TheoryError("the graph must have a node")
+    if any(isinstance(name, float) and math.isnan(name) for name in names):
+        raise TheoryError("nan is not the name of a node, as it does not equal itself")
     return names, links
 
 
