@@ -300,6 +300,7 @@ def integer(low: int | None = None, high: int | None = None) -> Rule:
 
 def require_runs(runs: object, low: int = 1, key: str = "runs") -> int:
     """Return a number of ``runs``, from ``low`` to MAX_RUNS; raises ScenarioError at ``key``."""
+    integer(low)(key, runs)  # one that is too small is not told of the largest
     result: int = integer(low, MAX_RUNS)(key, runs)
     return result
 
