@@ -33,6 +33,7 @@ from netkf.testing.noise import demand_agreement, family_level
 from netkf.testing.watching import (
     OTHER_GENERATOR,
     WatchedPart,
+    demand_kind,
     guard_user_code,
     is_number,
     make_part,
@@ -85,6 +86,7 @@ def check_channel(channel: Any, /, topology: Topology | None = None, **settings:
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
     part = make_part(channel, (Channel, Loss, Delay), settings)
+    demand_kind("topology", topology, Topology)
     _check_channel(part, topology, 0)
 
 

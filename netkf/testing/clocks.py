@@ -37,6 +37,8 @@ from netkf.testing.noise import demand_agreement, family_level
 from netkf.testing.watching import (
     OTHER_GENERATOR,
     WatchedPart,
+    demand,
+    demand_kind,
     demand_vector,
     guard_user_code,
     is_number,
@@ -79,7 +81,13 @@ def check_clock(clock: Any, /, link: Link | None = None, **settings: Any) -> Non
 
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
-    _check_clock(make_part(clock, (LinkClock,), settings), link, 0)
+    part = make_part(clock, (LinkClock,), settings)
+    demand_kind("link", link, tuple)
+    ids = () if link is None else link
+    demand(
+        all(isinstance(i, (int, np.integer)) for i in ids), "link", "must be a pair of ids", link
+    )
+    _check_clock(part, link, 0)
 
 
 def _check_clock(part: Any, link: Link | None, seed: int) -> None:

@@ -13,7 +13,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.testing.observed import Seen
 from netkf.testing.parents import check_parent
 from netkf.testing.small_runs import run, setups
-from netkf.testing.watching import WatchedPart, is_number, make_part
+from netkf.testing.watching import WatchedPart, demand_kind, is_number, make_part
 
 MAX_DEGREE = 8  # weights are checked for all pairs of degrees up to it
 SHIFT_TOLERANCE = 1e-9  # relative to the estimates before the shift is subtracted
@@ -46,6 +46,7 @@ def check_filter(filter: Any, /, same_as_parent: bool | None = None, **settings:
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
     part = make_part(filter, (Filter,), settings)
+    demand_kind("same_as_parent", same_as_parent, bool)
     watched = WatchedPart(part)
     watched.pickle_copy()
     _check_values(watched)

@@ -19,6 +19,7 @@ from netkf.testing.watching import (
     WatchedPart,
     demand,
     demand_array,
+    demand_kind,
     fail,
     guard_user_code,
     make_part,
@@ -51,6 +52,7 @@ def check_matching(matching: Any, /, topology: Topology | None = None, **setting
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
     part = make_part(matching, (SlotActivation,), settings)
+    demand_kind("topology", topology, Topology)
     _check_matching(part, topology, 0)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from netkf.linalg.arrays import ArrayLike, symmetric
 from netkf.testing.watching import demand, fail
+from netkf.theory.numerics.matrices import as_number, as_numbers
 
 
 def assert_dominated(P: ArrayLike, bound: ArrayLike, tolerance: float = 1e-9) -> None:
@@ -15,7 +16,8 @@ def assert_dominated(P: ArrayLike, bound: ArrayLike, tolerance: float = 1e-9) ->
     ``bound - P`` must be at least ``-tolerance`` times the largest absolute entry of the bound at
     that index. Raises AssertionError, which names the index with the lowest such ratio.
     """
-    lower, upper = (np.asarray(a, dtype=np.float64) for a in (P, bound))
+    lower, upper = as_numbers("P", P), as_numbers("bound", bound)
+    tolerance = as_number("tolerance", tolerance)
     for name, matrices in (("P", lower), ("bound", upper)):
         is_square = matrices.ndim >= 2 and matrices.shape[-1] == matrices.shape[-2]
         demand(is_square, name, "must be a square matrix or a stack of them", matrices.shape)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from netkf.core.errors import ScenarioError
+from netkf.core.fields import as_path
 from netkf.scenario.reading import load
 from netkf.scenario.scenario import Scenario
 
@@ -14,9 +15,10 @@ def scenario_files(folder: str | Path = "scenarios") -> list[Path]:
 
     Raises ScenarioError if there are none: pytest skips a test without parameters.
     """
-    files = sorted(Path(folder).glob("*.toml"))
+    folder = as_path("folder", folder)
+    files = sorted(folder.glob("*.toml"))
     if not files:
-        text = "holds no scenario files" if Path(folder).is_dir() else "is not a folder"
+        text = "holds no scenario files" if folder.is_dir() else "is not a folder"
         raise ScenarioError("scenario_files", text, str(folder), "name a folder of .toml files")
     return files
 

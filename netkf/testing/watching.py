@@ -50,6 +50,12 @@ def demand(holds: object, where: str, rule: str, got: object = None, remedy: str
         fail(where, rule, got, remedy)
 
 
+def demand_kind(name: str, value: object, kind: type) -> None:
+    """Raise AssertionError unless the argument ``name`` is None or of a kind."""
+    of_kind = value is None or isinstance(value, kind)
+    demand(of_kind, name, f"must be a {kind.__name__}", quote(value), "leave it out")
+
+
 def is_number(value: Any) -> bool:
     """Return True for a number of Python or numpy, not for an array or text."""
     return isinstance(value, (int, float, np.floating))

@@ -3,8 +3,19 @@
 import numpy as np
 import pytest
 
+import netkf
 from netkf import parts
-from netkf.testing import check_matching, check_plant, check_sensor, noise
+from netkf.testing import (
+    assert_dominated,
+    check_channel,
+    check_clock,
+    check_filter,
+    check_matching,
+    check_plant,
+    check_sensor,
+    noise,
+    scenario_files,
+)
 from netkf.testing import plants as of_plants
 from netkf.testing import sensors as of_sensors
 from netkf.testing.matchings import _check_matching
@@ -140,6 +151,25 @@ def test_what_is_of_another_family_is_told():
         check_matching(parts.Poisson(rate=1.0))
     with pytest.raises(AssertionError, match=r"could not be made with the settings .*missing"):
         check_plant(parts.LinearPlant, Q=[[1.0]])
+
+
+@pytest.mark.parametrize("odd", [3, "x", np.nan, {}, object, np.eye(2)[0]])
+def test_arguments_of_a_wrong_kind_are_told(odd):
+    calls = {
+        "topology": lambda: check_channel(parts.Bernoulli(delivery=0.5), topology=odd),
+        "topology: must": lambda: check_matching(parts.Matching("maximal"), topology=odd),
+        "link": lambda: check_clock(parts.Poisson(rate=1.0), link=odd),
+        "link: must": lambda: check_clock(parts.Poisson(rate=1.0), link=(odd, "a")),
+        "same_as_parent": lambda: check_filter(parts.Hybrid(epsilon=0.1), same_as_parent=odd),
+        "P": lambda: assert_dominated({"P": odd}, np.eye(2)),
+        "bound": lambda: assert_dominated(np.eye(2), {"bound": odd}),
+        "tolerance": lambda: assert_dominated(np.eye(2), np.eye(2), {"tolerance": odd}),
+        "folder": lambda: scenario_files([odd]),
+    }
+    for words, call in calls.items():
+        with pytest.raises((AssertionError, netkf.NetkfError), match=words) as caught:
+            call()
+        assert "\n" not in str(caught.value)
 
 
 @pytest.mark.slow
