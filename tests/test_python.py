@@ -263,6 +263,42 @@ def test_arguments_of_a_wrong_kind_are_one_line(odd, ring):
         assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pd.DataFrame,
+        lambda value: np.array(value, dtype=np.float32 if isinstance(value[0][0], float) else int),
+        lambda value: np.repeat(value, 2, axis=0)[::2],
+        lambda value: np.array(value, dtype=object),
+        lambda value: [np.array(row) for row in value],
+    ],
+    ids=["pandas", "float32", "strided", "objects", "rows"],
+)
+def test_arrays_of_every_kind_are_lists(kind, ring):
+    matrices = {
+        "plant.A": [[0.0, 1.0], [-1.0, 0.125]],
+        "sensors[0].R": [[0.25]],
+        "filter.cov": [[1.0, 0.0], [0.0, 1.0]],
+        "network.graph": [[0, 1], [1, 2], [2, 3], [3, 4], [4, 5], [5, 0]],
+        "sensors[0].nodes": [[0, 3]],
+        "probe": [[1.0, 2.5, 3.0]],
+    }
+
+    def made(convert):
+        values = {key: convert(value) for key, value in matrices.items()}
+        columns = ("sensors[0].nodes", "probe")
+        first = {key: getattr(values[key], "iloc", values[key])[0] for key in columns}
+        edges = {"network.graph": {"kind": "edges", "edges": values["network.graph"]}}
+        return ring.replace({**values, **first, **edges})
+
+    plain, other = made(list), made(kind)
+    assert plain == other
+    assert netkf.simulate(plain).fingerprint == netkf.simulate(other).fingerprint
+    for flags in (np.array([[True]]), [[np.True_]], pd.DataFrame([[True]])):
+        with pytest.raises(netkf.ScenarioError, match="R"):
+            ring.replace({"sensors[0].R": flags})
+
+
 def test_numbers_too_large_are_one_line(ring):
     drawn, large = netkf.load("scenarios/diffusion_regression.toml"), 10**30
     calls = {

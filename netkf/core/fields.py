@@ -53,8 +53,10 @@ class Rule:
     of_nodes: bool = False
     of_time: bool = False
 
-    def __call__(self, key: str, value: object) -> Any:
+    def __call__(self, key: str, value: Any) -> Any:
         """Return the converted value; raises ScenarioError at ``key`` if it breaks the rule."""
+        if getattr(value, "ndim", 0) and hasattr(value, "to_numpy"):  # a column or table of pandas
+            value = value.to_numpy()
         try:
             return self.convert(value)
         except ScenarioError as error:
@@ -437,9 +439,8 @@ def array(dimensions: int, name: str) -> Rule:
         if not np.isfinite(result).all():
             raise _SpecificError(f"must be a {name} with finite numbers")
         if np.abs(result).max() > MAX_MAGNITUDE:
-            raise _SpecificError(
-                f"must be a {name} with numbers of at most {MAX_MAGNITUDE:g} in size"
-            )
+            largest = f"{MAX_MAGNITUDE:g} in size"
+            raise _SpecificError(f"must be a {name} with numbers of at most {largest}")
         return result
 
     remedy = "write rows of equal length, [[a, b], [c, d]]" if dimensions == 2 else "write [a, b]"
@@ -453,7 +454,7 @@ def _has_bool_or_text(value: Any) -> bool:
     # numpy would convert both True and "1" to 1.0.
     if isinstance(value, (list, tuple)):
         return any(map(_has_bool_or_text, value))
-    return isinstance(value, (bool, str))
+    return isinstance(value, (bool, str)) or getattr(value, "dtype", None) == np.bool_
 
 
 vector = array(1, "vector")
