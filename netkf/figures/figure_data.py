@@ -264,7 +264,7 @@ def reduce_samples(
         promised=promised,
         rounding_from=np.inf if sink.rounding_from is None else sink.rounding_from,
         first_component=first_component,
-        delivered=sink.delivered,
+        delivered=sink.delivered.counts(),
         messages=summary["messages"],
         **attributes,
     )

@@ -211,7 +211,7 @@ class _Output:
         # How much of the recorded tables (readings, losses) the run has used; a run that ended
         # early did not use all that a complete one would have.
         if status == "complete":
-            usage = record_usage(self.scenario, self.links[0].sent if self.links else {})
+            usage = record_usage(self.scenario, self.links[0].sent.counts() if self.links else {})
             summary |= {"records": usage} if usage else {}
             if self.scenario.held_out_sensors:
                 from netkf.runs.held_out import errors_of_replica

@@ -18,7 +18,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import node_columns
 from netkf.runs.labels import covariance_notes
 from netkf.runs.quantities import NETWORK, quantity_rows, sample_names, sample_quantities
-from netkf.runs.transmissions import Transmissions, count_pairs
+from netkf.runs.transmissions import PairCounter, Transmissions
 from netkf.scenario.scenario import Scenario
 from netkf.trace.nees import blurred_from, errors, traces
 from netkf.trace.recorder import Sink
@@ -52,7 +52,7 @@ class SummarySink(Sink):
         self.trace: list[FloatArray] = []
         self.nees: list[FloatArray] = []
         self.first_component: list[FloatArray] = []
-        self.delivered: dict[tuple[int, int], int] = {}
+        self.delivered = PairCounter()
         self.rounding_from: float | None = None
         self.diverged: list[int] = []
         self.last: tuple[FloatArray, ...] = ()
@@ -66,9 +66,7 @@ class SummarySink(Sink):
         self.clipped += int(rows["message"][rows["kind"] == CODES["clip"]].sum())
         is_delivery = rows["kind"] == CODES["deliver"]
         node, peer = rows["node"][is_delivery], rows["peer"][is_delivery]
-        links = count_pairs(np.minimum(node, peer), np.maximum(node, peer))
-        for i, j, count in zip(*(column.tolist() for column in links), strict=True):
-            self.delivered[i, j] = self.delivered.get((i, j), 0) + count
+        self.delivered.add(np.minimum(node, peer), np.maximum(node, peer))
 
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
@@ -193,10 +191,13 @@ def summarise(
     if network is not None:
         rows = [a | b for a, b in zip(rows, quantity_rows(NETWORK, network), strict=True)]
     *nodes, overall = rows
-    counts = sink.transmissions
-    for row in nodes:
-        row |= {"sent": counts.sent[row["node"]], "transmissions": counts.count_for(row["node"])}
-    overall["transmissions"] = counts.total
+    counts = {
+        "sent": sink.transmissions.sent(scenario.nodes),
+        "transmissions": sink.transmissions.transmissions(scenario.nodes),
+    }
+    for row, *values in zip(nodes, *counts.values(), strict=True):
+        row |= dict(zip(counts, values, strict=True))
+    overall["transmissions"] = sum(counts["transmissions"])
     return {
         "nodes": nodes,
         "overall": overall,
@@ -210,7 +211,7 @@ def summarise(
         ],
         "messages": {
             **messages,
-            "transmissions": counts.total,
+            "transmissions": overall["transmissions"],
             "in_flight": messages["sent"] - messages["delivered"] - messages["lost"],
         },
     }
