@@ -9,6 +9,7 @@ import numpy as np
 
 from netkf.core.fields import Component, field, integer, positive
 from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.linalg.compiling import kernel
 
 MAX_BITS = 48
 """More would be beyond the digits of a float64."""
@@ -39,14 +40,43 @@ class Quantisation(Component):
         """The variance ``step^2 / 12`` of the error of a number."""
         return self.step**2 / 12.0
 
+    @property
+    def levels(self) -> float:
+        """The number of values that are sent."""
+        return 2.0**self.bits
+
     def apply(self, values: FloatArray, random: np.random.Generator) -> tuple[FloatArray, int]:
         """Return what is received of ``values`` (K,), and how many were clipped."""
-        dither = self.step * (random.random(values.shape) - 0.5)
-        level = np.floor((values + dither + self.range) / self.step)
-        kept = np.clip(level, 0.0, 2.0**self.bits - 1.0)
-        received = (kept + 0.5) * self.step - self.range - dither
-        # What has heard of no mass must not divide by an error: nothing is told as nothing.
-        return np.where(values == 0.0, 0.0, received), int((kept != level).sum())
+        received = np.array(values, dtype=np.float64, order="C")
+        units, scale = random.random(values.shape), (self.step, self.range, self.levels)
+        return received, int(quantise_numbers(received, units, *scale))
+
+
+@kernel
+def quantise_number(
+    value: float, unit: float, step: float, limit: float, levels: float
+) -> tuple[float, bool]:
+    """Return what is received of a number for which ``unit`` in [0, 1) was drawn, and whether it
+    was clipped.
+    """
+    dither = step * (unit - 0.5)
+    level = np.floor((value + dither + limit) / step)
+    kept = min(max(level, 0.0), levels - 1.0)
+    # What has heard of no mass must not divide by an error: nothing is told as nothing.
+    received = 0.0 if value == 0.0 else (kept + 0.5) * step - limit - dither
+    return received, kept != level
+
+
+@kernel
+def quantise_numbers(
+    values: FloatArray, units: FloatArray, step: float, limit: float, levels: float
+) -> int:
+    """Replace ``values`` (K,) by what is received of them; return how many were clipped."""
+    clipped = 0
+    for k in range(len(values)):
+        values[k], beyond = quantise_number(values[k], units[k], step, limit, levels)
+        clipped += beyond
+    return clipped
 
 
 class Encoder:

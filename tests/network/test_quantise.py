@@ -8,6 +8,7 @@ import netkf
 from netkf.checks.check import find_checks
 from netkf.checks.equations import WITHOUT_PAPER
 from netkf.core.errors import ScenarioError
+from netkf.engines.compiled.engine import CompiledEngine
 from netkf.engines.simpy.engine import SimpyEngine
 from netkf.network.quantise import Encoder, Quantisation
 from netkf.rng.streams import Streams
@@ -237,6 +238,64 @@ def test_the_steady_error_is_that_of_the_plain_recursion(scenario_of):
     with_noise, without = expected.values()
     assert (np.abs(blocks.mean(axis=0) - with_noise) < off).all()
     assert (np.abs(blocks.mean(axis=0) - without) > off)[np.diag_indices(3)].all()
+
+
+LOSS = {"kind": "bernoulli", "delivery": 0.6}
+SHARED = {"kind": "shared", "delivery": 0.6, "share": 0.5}
+DELAY = {"kind": "exponential", "mean": 0.3}
+AT_NODES = {"kind": "poisson", "rate": 1.0, "at": "nodes"}
+LIVES = [{"kind": "duty", "nodes": [1, 2], "period": 7.0, "up": 4.0}]
+TRIGGERED = {"kind": "event-triggered", "trigger": "consensus", "thresholds": [0.1, 0.1],
+             "inner": {"kind": "hcmci", "consensus": "information"}}  # fmt: skip
+
+
+def few_bits(folder, time, filtering, network):
+    """Four nodes on a cycle, two with sensors; numbers beyond 0.6 are clipped."""
+    plant = PLANTS[time] | {
+        "cov": np.eye(N3),
+        {"slots": "Q", "clocks": "B"}[time]: 0.5 * np.eye(N3),
+    }
+    sampling = {"sampling": {"kind": "periodic", "period": 1.0}} if time == "clocks" else {}
+    sensor = {"nodes": [0, 1], "H": [[1.0, 0.5, 0.2]], "R": [[1.0]], **sampling}
+    quantise = {"bits": 5, "range": 0.6}
+    graph = {"kind": "cycle", "nodes": 4}
+    table = {"format": 1, "name": "few", "horizon": 15.0, "probe": 1.0, "plant": plant}
+    table |= {"sensors": [sensor], "filter": filtering}
+    table["network"] = {"graph": graph, "quantise": quantise, **network}
+    return from_table(table, folder)
+
+
+@pytest.mark.parametrize(
+    ("time", "filtering", "network"),
+    [
+        ("slots", {"kind": "diffusion"}, {}),
+        ("slots", {"kind": "hcmci", "steps": 2}, {"channel": {"loss": LOSS}}),
+        ("slots", {"kind": "icf", "steps": 3}, {"lives": LIVES}),
+        ("slots", {"kind": "gossip"}, {"activation": {"kind": "matching", "protocol": "maximal"}}),
+        ("slots", TRIGGERED, {"channel": {"loss": SHARED}}),
+        ("slots", {"kind": "push-sum", "gamma": 2, "delta": 4.1}, {"channel": {"loss": LOSS}}),
+        ("clocks", {"kind": "hybrid", "epsilon": 0.3}, {"channel": {"loss": LOSS}}),
+        ("clocks", {"kind": "covariance-intersection", "epsilon": 0.3},
+         {"activation": AT_NODES, "channel": {"loss": LOSS, "delay": DELAY}}),
+        ("clocks", {"kind": "hcmci", "consensus": "information"}, {"lives": LIVES}),
+        ("clocks", {"kind": "push-sum"}, {"activation": AT_NODES}),
+    ],
+)  # fmt: skip
+def test_compiled_code_quantises_as_simpy(time, filtering, network, tmp_path):
+    """Rows of clips stand where SimPy has them, and runs of a batch are those of their own."""
+    activation = {"kind": "broadcast"} if time == "slots" else {"kind": "poisson", "rate": 1.0}
+    scenario = few_bits(tmp_path, time, filtering, {"activation": activation, **network})
+    one, other = (netkf.simulate(scenario, seed=3, engine=name) for name in ("simpy", "compiled"))
+    assert one.count("clip") > 0
+    assert one.fingerprint == other.fingerprint
+    np.testing.assert_allclose(one.xhat, other.xhat, atol=1e-10)
+    np.testing.assert_allclose(one.P, other.P, rtol=1e-10, atol=1e-10)
+    for batch in CompiledEngine().run_many(scenario, 3, range(10)):
+        for k, replica in enumerate(batch.replicas):
+            alone = netkf.simulate(scenario, seed=3, replica=replica, engine="compiled")
+            np.testing.assert_array_equal(alone.xhat, batch.xhat[k])
+            counts = np.bincount(alone.log["kind"], minlength=batch.counts.shape[1])
+            np.testing.assert_array_equal(counts, batch.counts[k])
 
 
 @pytest.mark.parametrize("kind", ["constant-gain", "hcmci"])

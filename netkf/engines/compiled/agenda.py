@@ -106,6 +106,7 @@ def is_immediate(scenario: Scenario) -> bool:
         and ticks_apart(network.activation)
         and delay_is_zero(network.channel)
         and not scenario.messages_queue
+        and scenario.network.quantise is None
         # A negative max_age makes even messages of age 0 too old.
         and node_filter.timing.max_age >= 0.0
         # Each message of a tick has a bit of one integer.

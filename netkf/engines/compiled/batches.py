@@ -185,7 +185,7 @@ def drawn_together(scenario: Scenario) -> bool:
     """
     if scenario.views is not None or len(scenario.plant.changes) or scenario.links_move:
         return False
-    if scenario.network.lives or scenario.network.clocks:
+    if scenario.network.lives or scenario.network.clocks or scenario.network.quantise:
         return False
     if not scenario.sampled_sensors:
         return uses_grid(scenario)
@@ -249,7 +249,7 @@ def _expected_ticks(scenario: Scenario) -> float:
 class BatchDraws:
     """All random numbers of the R runs ``replicas``, drawn up to the horizon from ``seed``."""
 
-    lives = NO_LIVES
+    lives, dither = NO_LIVES, None
 
     def __init__(self, scenario: Scenario, seed: int, replicas: range) -> None:
         self.clocks: dict[int, NodeTime] = {}

@@ -24,6 +24,7 @@ from netkf.algorithms.records import Kernels, double_past, make_records, resized
 from netkf.engines.compiled.batch_arrays import BatchArrays
 from netkf.engines.compiled.clock_loop import NO_MODELS, batch_loop, clock_loop, clock_verbs
 from netkf.engines.compiled.nonlinear_samples import nonlinear_sensors
+from netkf.engines.compiled.quantiser import PayloadQuantiser
 from netkf.engines.compiled.samples import entries_of
 from netkf.engines.compiled.slot_pairs import BlockColumns, common_table
 from netkf.engines.compiled.state import (
@@ -79,6 +80,7 @@ class ClockFilters:
             messages=self._room(messages),
         )
         self.record, self.start = self.records.struct, self.records.copied()
+        self.quantiser = PayloadQuantiser(scenario.network.quantise, self.records)
         self._first_models = np.ascontiguousarray(start.nodes["model"])
         self.run = self._run_of(scenario, start, links, messages)
         self._run = self.run.general
@@ -91,6 +93,8 @@ class ClockFilters:
                 self._own_models = [model.tables() for model in self._rates]
                 own_models = np.stack([tables.memory for tables in self._own_models])
         self._verbs = clock_verbs(kernels, self.record, self.run, reads, linear, own_models)
+        # Lost payloads take their dither too: what is drawn must not depend on what is heard.
+        self._verbs.counts_sends |= scenario.network.quantise is not None
         self._conserved: tuple[str, ...] = ()
         if "conserved" in self.records.arrays:
             first = scenario.initial_estimate(infos[0].node)
@@ -236,6 +240,7 @@ class ClockFilters:
         """Make room for so many messages; those that are there stay."""
         messages = max(messages, len(self.run.message))
         self.record.payload = resized(self.record.payload, self._room(messages))
+        self.quantiser.find_payload()
         for name, array in self._inbox(messages).items():
             setattr(self.run, name, array)
 

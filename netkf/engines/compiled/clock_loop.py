@@ -21,6 +21,7 @@ from netkf.engines.base import LONGER, MIN_GAP_SHARE
 from netkf.engines.compiled.batch_arrays import BatchArrays, begin, finish, reset_messages
 from netkf.engines.compiled.events import (
     ABSORB,
+    CLIP,
     DONE,
     GO_ON,
     LOST,
@@ -72,6 +73,7 @@ from netkf.engines.compiled.nonlinear_samples import (
     set_pair,
 )
 from netkf.engines.compiled.outcomes import OUT_OF_RANGE
+from netkf.engines.compiled.quantiser import quantise_payload
 from netkf.engines.compiled.state import AFTER_READINGS, NODES, Instants, Simulation
 from netkf.linalg.addresses import NOTHING, address_of, call_at, call_at_two, number_at
 from netkf.linalg.arrays import IntArray
@@ -375,15 +377,12 @@ def send_all(
     if verbs.decides == 1 and run.sends[0] == 0:
         release(state, m)
         return
+    if becomes != NONE_SENT:
+        state.clipped = quantise_payload(state.quantiser, h, m, 0)
     if broadcast:
         record_event(state, now, TRANSMIT, state.nodes[h].id, -1, state.nodes[h].sent)
         state.nodes[h].sent += 1
-    # The reading of this instant goes with the message.
-    tag, used = -1, False
-    if verbs.sends_readings == 1:
-        reading = state.nodes[h].reading
-        if reading >= 0 and state.instants.t[reading] == now:
-            tag = reading
+    tag, used = -1 if verbs.sends_readings == 0 else reading_at(state, h, now), False
     for k in range(first, after):
         w = state.outgoing[k]
         delay = snapped(ticks.delay[outcome + k - first], state.per_second)
@@ -403,6 +402,15 @@ def send_all(
 
 
 @kernel
+def reading_at(state: Simulation, h: int, now: float) -> int:
+    """Return the instant of the reading of node ``h`` ``now``, which goes with its message, or
+    -1.
+    """
+    reading = state.nodes[h].reading
+    return int(reading) if reading >= 0 and state.instants.t[reading] == now else -1
+
+
+@kernel
 def on_absorb(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, now: float) -> None:
     """Let the next node absorb all messages of this instant ``now`` (seconds), in the order of
     senders.
@@ -411,7 +419,7 @@ def on_absorb(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, 
     node, oldest, count = state.nodes[h], 0.0, 0
     if len(run.pairs.row) > 0:
         # The reading of this instant, of which messages may bring another part.
-        own = node.reading if node.reading >= 0 and state.instants.t[node.reading] == now else -1
+        own = reading_at(state, h, now)
         run.reading, run.rows[OWN] = OWN, 0
         if own >= 0:
             whiten_instant(state, run, OWN, own)
@@ -537,6 +545,9 @@ def is_sent(state: Simulation, w: int, delay: float, now: float) -> bool:
     sender_id = state.nodes[direction.sender].id
     receiver_id = state.nodes[direction.receiver].id
     record_event(state, now, SEND, sender_id, receiver_id, number)
+    if state.clipped > 0:
+        record_event(state, now, CLIP, sender_id, -1, state.clipped)
+        state.clipped = 0
     # ``not >=`` catches both LOST, which is negative, and nan.
     if not delay >= 0.0:
         record_event(state, now, LOST, sender_id, receiver_id, number)

@@ -17,6 +17,7 @@ from netkf.engines.compiled.batches import flow_batches, quick_runs
 from netkf.engines.compiled.flow import FlowRun, Source, Workspace
 from netkf.engines.compiled.gates import ungated_readings
 from netkf.engines.compiled.own_sensors import is_own, reads_in_python
+from netkf.engines.compiled.quantiser import unquantised_messages
 from netkf.engines.compiled.slot_pairs import blocks_refusal
 from netkf.engines.compiled.slot_run import run_slots, slot_batches, with_ends
 from netkf.engines.compiled.slot_setup import slot_setup
@@ -73,9 +74,9 @@ class CompiledEngine(Engine):
         if unknown:
             family, part = unknown[0]
             return f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
-        network, rule = scenario.network, ""
-        if network.quantise:
-            rule = "messages of few bits"
+        rule = ""
+        if (unquantised := unquantised_messages(scenario)) is not None:
+            rule = unquantised
         elif (ungated := ungated_readings(scenario)) is not None:
             rule = f"a gate on {ungated}"
         if rule:

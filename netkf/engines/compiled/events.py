@@ -21,11 +21,11 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.trace.schema import CODES
 
-SENSE, REFUSE, TICK, SEND, DELIVER, LOST, LATE, ABSORB, TRANSMIT, LINK = (
+SENSE, REFUSE, TICK, SEND, DELIVER, LOST, LATE, ABSORB, TRANSMIT, LINK, CLIP = (
     CODES[kind]
     for kind in (
         *("sense", "refuse", "tick", "send", "deliver", "lost", "late", "absorb", "transmit"),
-        "link",
+        *("link", "clip"),
     )
 )
 (GO_ON, WANT_TICKS, WANT_STEPS, WANT_MESSAGES, WANT_ROWS, WANT_SAMPLES, WANT_REBASE, WANT_LIFE,

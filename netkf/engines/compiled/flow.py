@@ -32,6 +32,7 @@ from netkf.engines.compiled.events import (
 from netkf.engines.compiled.lane_series import series_of_lanes
 from netkf.engines.compiled.life_tables import life_table, silence
 from netkf.engines.compiled.pair_exchange import pair_exchange
+from netkf.engines.compiled.quantiser import PayloadQuantiser, dither_of
 from netkf.engines.compiled.sample_tables import samples_of
 from netkf.engines.compiled.samples import by_node, entries_of, record_samples
 from netkf.engines.compiled.senders import senders_of
@@ -86,7 +87,7 @@ AT_START = (
         "receivers",
         "absorbing",
     ),
-    "samples",
+    *("clipped", "samples"),
 )
 """Integer fields of a Simulation that are 0 when a run begins."""
 
@@ -128,6 +129,7 @@ class Source:
         self.clocks = {index[i]: c for i, c in node_times(scenario, streams).items()}
         known = {"instants": samples.instants, "truth": self.states, "lives": self.lives}
         self._ticks = Schedule(scenario, streams, **known)
+        self.dither = dither_of(scenario, streams)
 
     def window(self) -> TickArrays:
         """Return the next window of ticks."""
@@ -177,6 +179,7 @@ class Workspace:
         self.clocked: ClockFilters | None = None
         if not is_immediate(scenario):
             self.clocked = ClockFilters(scenario, kernels, self._start, FIRST_MESSAGES)
+        self._quantiser = self.clocked.quantiser if self.clocked else PayloadQuantiser()
         # The event loop is compiled once for all n: its verbs alone have loops over the states.
         self._unrolled = kernels.unrolled and self.clocked is None
 
@@ -254,6 +257,7 @@ class Workspace:
             # Plants that change have no frames.
             frames=draws.states.frame_times if not len(changes) else changes,
             lives=draws.lives.t,
+            quantiser=self._quantiser.with_streams(draws.dither),
             probes=self._probes,
             buffer=self._buffer if buffer is None else buffer,
             # The recorder keeps the rows of a traced run, so the next one gets others.
@@ -277,9 +281,9 @@ class Workspace:
             "most_messages": max_messages,
             "free_count": len(self._pool[0]),
             # Each message of a tick leaves a "send", its outcome and perhaps an "absorb", and the
-            # tick or transmission two rows more; an instant of samples leaves one row per sensing
-            # node, and a gate one per sample.
-            "most_rows": 2
+            # tick or transmission two rows more, and payloads of few bits of both ends two; an
+            # instant of samples leaves one row per sensing node, and a gate one per sample.
+            "most_rows": (2 if self._scenario.network.quantise is None else 4)
             + 3 * max_messages
             + of_instant * int(np.diff(instants.first).max(initial=0))
             # Links that come up or go down.

@@ -67,5 +67,14 @@ def with_refusals(
     nodes = np.full(1, -1) if setup.algorithm.timing.pooled else setup.nodes
     made["node"] = nodes[np.array([s.estimator for s in setup.assigned])[parts[known]]]
     places = read[last[known] - 1] + 1
+    return insert_rows(rows, places, made, before_sample)
+
+
+def insert_rows(
+    rows: np.ndarray, places: IntArray, made: np.ndarray, before_sample: IntArray
+) -> tuple[np.ndarray, IntArray]:
+    """Return ``rows`` (K,) with those ``made`` (M,) before the increasing ``places`` (M,) among
+    them, and the number of rows before each sample, of ``before_sample`` (T,).
+    """
     shifted = before_sample + np.searchsorted(places, before_sample, side="right")
     return np.insert(rows, places, made), shifted

@@ -21,6 +21,7 @@ from netkf.algorithms.kernels.run import (
 )
 from netkf.algorithms.models import MapModel, changing_models
 from netkf.algorithms.records import Kernels, make_records
+from netkf.engines.compiled.quantiser import PayloadQuantiser
 from netkf.engines.compiled.slot_loop import (
     EXCHANGE,
     PREDICT,
@@ -68,6 +69,7 @@ class SlotFilters:
             blocks=blocks,
             lanes=LANES,
         )
+        self.quantiser = PayloadQuantiser(setup.quantise, self.records)
         self._models = self._models_of(active)
         self._run = self._run_of(no_pairs() if pairs is None else pairs, active)
         words = len(self._models[0].memory)
@@ -181,6 +183,7 @@ class SlotFilters:
             direction=self._setup.links.direction,
             varies=H.shape[0] * H.shape[1] > 1,
             models=self._memories,
+            quantiser=self.quantiser.struct,
             start=0,
             end=0,
             **drawn,

@@ -15,6 +15,7 @@ from netkf.algorithms.kernels.gates import pass_gate
 from netkf.algorithms.kernels.nonlinear_rows import linearise_rows
 from netkf.algorithms.kernels.run import SlotRun
 from netkf.algorithms.records import Kernels
+from netkf.engines.compiled.quantiser import Quantiser, quantise_payload
 from netkf.linalg.addresses import NOTHING, AnyStruct, address_of, call_at, call_at_two, seen_as
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
@@ -53,6 +54,9 @@ class SlotPlan(Struct):
         sends nothing; empty if all nodes are asked, and send
     uniform : (B, S, E, H, L), uniform numbers for these decisions; empty unless randomised
     refused : (B, S, G, L), 1 where a gate refuses a part of a reading; empty without one
+    quantiser : how messages are quantised, see ``quantiser``
+    speaks : (B, S, E, H, L), 1 if a node has links to send on, where messages are of few bits
+    clipped : (B, S, E, H, L), how many numbers of its message are clipped, if they are
     varies : whether H differs from block to block and slot to slot
     models : (H, words), the struct of each filter's model, (0, words) if ``run.model`` is all's
     start, end : the slots that a call simulates, of those of the plan
@@ -74,6 +78,9 @@ class SlotPlan(Struct):
     sent: np.ndarray
     uniform: FloatArray
     refused: np.ndarray
+    quantiser: Quantiser
+    speaks: np.ndarray
+    clipped: np.ndarray
     varies: int
     models: IntArray
     begin: int
@@ -251,6 +258,8 @@ def exchange(
             call_at_two(verbs.emit, record, h, m, run)
             if decides:
                 store_flags(lanes, plan.sent, b, s, e, h, load_flags(lanes, run.sends))
+            if plan.speaks.shape[0] > 0:
+                quantise_message(plan, b, s, e, h, nodes)
         if decides:
             drop_silent(run, plan, b, s, e)
     if e != plan.stop:
@@ -263,6 +272,17 @@ def exchange(
                 call_at_two(verbs.emit, record, h, nodes + k, run)
                 call_at_two(verbs.translate, record, nodes + k, k, run)
             call_at(verbs.absorb, record, h, run)
+
+
+@kernel
+def quantise_message(plan: SlotPlan, b: int, s: int, e: int, h: int, nodes: int) -> None:
+    """Quantise the message of node ``h`` in all lanes in which it is sent."""
+    lanes = plan.speaks.shape[4]
+    for q in range(lanes):
+        silent = len(plan.sent) > 0 and plan.sent[b, s, e, h, q] == 0
+        if plan.speaks[b, s, e, h, q] == 1 and not silent:
+            stream = (b * lanes + q) * nodes + h
+            plan.clipped[b, s, e, h, q] = quantise_payload(plan.quantiser, stream, h, q)
 
 
 @kernel

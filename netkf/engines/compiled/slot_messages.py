@@ -517,6 +517,28 @@ def count_sends(
 
 
 @kernel
+def mark_senders(
+    links: SlotChannels,
+    messages: SlotMessages,
+    exchanged: np.ndarray,
+    runs: int,
+    speaks: np.ndarray,
+) -> None:
+    """Set ``speaks`` (B, S, E, N, L) to 1 for nodes with links to send on, in the slots that are
+    ``exchanged`` (S,), in each of the ``runs``.
+    """
+    paired, lanes = len(messages.pair_count) > 0, speaks.shape[4]
+    for r in range(runs):
+        for s in range(len(exchanged)):
+            for e in range(speaks.shape[2] if exchanged[s] else 0):
+                for a in range(messages.pair_count[r, s, e] if paired else len(links.ends)):
+                    link = messages.active[r, s, e, a] if paired else a
+                    for end in range(links.per_link):
+                        if links.talks[e, link * links.per_link + end] == 1:
+                            speaks[r // lanes, s, e, links.ends[link, end], r % lanes] = 1
+
+
+@kernel
 def count_arrivals(
     lanes: Lanes, links: SlotLinks, up: np.ndarray, counted: np.ndarray, counts: FloatArray
 ) -> None:

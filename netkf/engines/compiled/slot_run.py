@@ -24,7 +24,9 @@ from netkf.engines.base import Progress
 from netkf.engines.compiled.gates import REFUSE, count_refusals, with_refusals
 from netkf.engines.compiled.outcomes import channel_streams, demand_probabilities
 from netkf.engines.compiled.own_sensors import read_whitened
+from netkf.engines.compiled.quantiser import dither_of
 from netkf.engines.compiled.samples import by_node, record_samples
+from netkf.engines.compiled.slot_clips import CLIP, count_clips, with_clips
 from netkf.engines.compiled.slot_filters import SlotFilters
 from netkf.engines.compiled.slot_loop import WHOLE, SlotSamples
 from netkf.engines.compiled.slot_messages import (
@@ -50,6 +52,7 @@ from netkf.engines.compiled.slot_messages import (
     draw_pairs,
     draw_uniforms,
     make_rows,
+    mark_senders,
 )
 from netkf.engines.compiled.slot_pairs import matrix_of
 from netkf.engines.compiled.slot_setup import BATCH_BYTES, AssignedSensor, SlotSetup, slot_setup
@@ -98,7 +101,7 @@ class SampledStates(NamedTuple):
 class SlotBlock(NamedTuple):
     """Results of S slots of R runs: indices ``sampled`` (T,) of the slots with a sample, the
     ``samples`` of these slots or of all slots so far, the times of the slots, their messages, and
-    ``SlotPlan.refused``.
+    ``SlotPlan.refused`` and ``clipped``.
     """
 
     sampled: np.ndarray
@@ -106,6 +109,7 @@ class SlotBlock(NamedTuple):
     times: SlotTimes
     messages: SlotMessages
     refused: np.ndarray
+    clipped: np.ndarray
 
 
 class SlotRuns:
@@ -153,6 +157,7 @@ class SlotRuns:
         self.counts = np.zeros((runs, len(KINDS)), dtype=np.int64)
         self._begin_truth()
         self._begin_readings()
+        self._filters.quantiser.with_streams(dither_of(scenario, streams))
         # Of each run, where kernels cannot draw the messages.
         self._tables: list[SlotTables] = []
         if not setup.is_drawn:
@@ -263,12 +268,12 @@ class SlotRuns:
             entries=np.maximum(self.setup.entries, 0) if self.setup.views is not None else _ALL,
         )  # fmt: skip
         slots = times.first + sampled
-        refused = self._simulate(times, messages, (y, H, rebased), kernel_samples)
+        decided = self._simulate(times, messages, (y, H, rebased), kernel_samples)
         if not drawn and responses is not None and responses.believed is not None:
             # Recorded states may be unknown, where coordinates begin is not.
             moved = responses.believed.states(slots)[:, self.setup.entries]
             samples.xhat[:, times.sample[sampled]] += moved
-        return SlotBlock(sampled, samples, times, messages, refused)
+        return SlotBlock(sampled, samples, times, messages, *decided)
 
     def _simulate(
         self,
@@ -276,9 +281,12 @@ class SlotRuns:
         messages: SlotMessages,
         readings: tuple[FloatArray, FloatArray, np.ndarray],
         samples: SlotSamples,
-    ) -> np.ndarray:
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Simulate the filters; return ``refused`` and ``clipped`` of ``SlotPlan``."""
         filters, count, (y, H, rebased) = self._filters, len(times.start), readings
         gated = len(self.setup.assigned) if self.setup.gate is not None else 0
+        unread, begin = self._missed_readings(messages, count), WHOLE
+        speaks = self._find_senders(times, messages, unread)
         drawn: dict[str, Any] = {
             "first": self._slot,
             "sensed": times.sensed,
@@ -289,8 +297,9 @@ class SlotRuns:
             "sent": messages.sent,
             "uniform": self._draw_uniforms(messages.sent),
             "refused": np.zeros((self._blocks, count, gated, LANES), dtype=np.uint8),
+            "speaks": speaks,
+            "clipped": np.zeros(speaks.shape, dtype=np.int32),
         }
-        unread, begin = self._missed_readings(messages, count), WHOLE
         # Nodes begin again before the first slot of a block.
         for h in self._tables[0].restarts.get(self._slot, ()) if self._tables else ():
             filters.restart(h, self._moved(h))
@@ -313,8 +322,24 @@ class SlotRuns:
         if self.setup.pairs is not None:
             self.setup.pairs.nonlinear.raise_error()
         self._slot += count
-        refused: np.ndarray = drawn["refused"]
-        return refused
+        return drawn["refused"], drawn["clipped"]
+
+    def _find_senders(
+        self, times: SlotTimes, messages: SlotMessages, unread: np.ndarray
+    ) -> np.ndarray:
+        """Return (B, S, E, N, L) 1 where nodes have links to send on; empty if messages are not
+        quantised.
+        """
+        if self._scenario.network.quantise is None:
+            # Five dimensions, as kernels are compiled for.
+            return np.zeros((0,) * 5, dtype=np.uint8)
+        speaks = np.zeros((self._blocks, *unread.shape, LANES), dtype=np.uint8)
+        for r, tables in enumerate(self._tables):
+            speaks[r // LANES, ..., r % LANES] = tables.speaks
+        if not self._tables:
+            mark_senders(self._channels, messages, times.exchanged, self.runs, speaks)
+            speaks[:, unread] = 0
+        return speaks
 
     def _moved(self, h: int) -> FloatArray:
         """Return by how much the prior of a filter differs in the coordinates of this slot."""
@@ -731,7 +756,18 @@ class SlotRuns:
         else:
             before_sample = np.zeros(len(block.sampled), dtype=np.int64)
             rows = self._rows(block, 0, len(block.times.start), before_sample)
-        return with_refusals(self._scenario, block.times, block.refused, rows, before_sample)
+        return self._with_decisions(block, rows, before_sample)
+
+    def _with_decisions(
+        self, block: SlotBlock, rows: np.ndarray, before_sample: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return EVENT rows with those of gates and of clipped messages, see ``events``."""
+        times, scenario = block.times, self._scenario
+        rows, before = with_refusals(scenario, times, block.refused, rows, before_sample)
+        if not block.clipped.any():
+            return rows, before
+        steps = step_times(scenario, self.setup, times.first, len(times.start))
+        return with_clips(self.setup, steps, block.clipped, rows, before)
 
     def first_events(self, block: SlotBlock) -> Iterator[np.ndarray]:
         """Yield the EVENT rows of the first run of a batch in a block, for some slots at a time."""
@@ -744,7 +780,7 @@ class SlotRuns:
         count = len(block.times.start)
         for first in range(0, count, size):
             rows = self._rows(block, first, min(first + size, count), before_sample)
-            yield with_refusals(self._scenario, block.times, block.refused, rows, before_sample)[0]
+            yield self._with_decisions(block, rows, before_sample)[0]
 
     def _rows(
         self, block: SlotBlock, first: int, stop: int, before_sample: np.ndarray
@@ -771,6 +807,7 @@ class SlotRuns:
             self._count_drawn(block)
         refused = times.recorded & times.sensed
         counts[:, REFUSE] += count_refusals(block.refused, refused, self.runs)
+        counts[:, CLIP] += count_clips(block.clipped, times.recorded, self.runs)
         if setup.stages.stopping >= 0:
             since = by_run(self._stopped, self.runs) - times.first
             counts[:, STOP] += ((since >= 0) & (since < times.recorded.sum())).sum(axis=1)

@@ -38,6 +38,7 @@ from netkf.network.deliveries import Deliveries, DeliveringLoss
 from netkf.network.graphs import Link
 from netkf.network.losses import GilbertElliott, identical_per_link, law_in_kernels
 from netkf.network.matchings import PROTOCOLS, Broadcast, Matching, maximal_matchings
+from netkf.network.quantise import Quantisation
 from netkf.plants.regressors import RegressorSensor
 from netkf.plants.slot_paths import SlotSensors
 from netkf.plants.transitions import frame_slots
@@ -164,6 +165,7 @@ class SlotSetup:
         linear = not self.regressor_sensors and not self.nonlinear_sensors
         all_fixed = len(self.kernel_sensors) == len(self.assigned) and linear
         self.gate: Gate | None = scenario.filter.gate
+        self.quantise: Quantisation | None = scenario.network.quantise
         # Who is down has no reading, and a gate changes H.
         self.varies = not all_fixed or bool(scenario.network.lives) or self.gate is not None
         # The same in all blocks of runs and all slots, hence 1, 1.

@@ -142,6 +142,7 @@ class SlotTables:
     the step ends, who absorbs), and the links that a last sample looks at.
 
     awake : (S, E, N) flags: nodes that may send, in the slots just made; empty without lives
+    speaks : (S, E, N) flags: nodes with links to send on
     """
 
     def __init__(self, scenario: Scenario, streams: Streams, setup: SlotSetup) -> None:
@@ -173,7 +174,7 @@ class SlotTables:
         self._sent_so_far = np.zeros(len(setup.directions), dtype=np.int64)
         self._under_way = NO_MESSAGES
         self._uses: Uses | None = None
-        self.awake = np.zeros((0,) * 3, dtype=np.uint8)
+        self.awake = self.speaks = np.zeros((0,) * 3, dtype=np.uint8)
 
     def _append_link(self, row: Any) -> None:
         if self._part >= 0:
@@ -233,6 +234,8 @@ class SlotTables:
         elif times.exchanged[0]:
             # Broadcasts use all links.
             asked[:, setup.ends.ravel()] = 1
+        if self._scenario.network.quantise is not None:
+            self._who_sends(times, uses)
         return np.asarray(asked * ~self._down(times)[0])
 
     def following(self, times: StepTimes, decide: Decide | None = None) -> np.ndarray:
@@ -401,6 +404,8 @@ class SlotTables:
         if setup.may_miss:
             unread = setup.unread(times.first, len(times.start))
             sends &= ~unread[uses.slot, uses.step, sender]
+        self.speaks = np.zeros((*times.begin.shape, len(setup.nodes)), dtype=np.uint8)
+        self.speaks[uses.slot[sends], uses.step[sends], sender[sends]] = 1
         return np.asarray(sends)
 
     def _send(self, times: StepTimes, uses: Uses, up: np.ndarray) -> Messages:

@@ -21,6 +21,7 @@ from netkf.algorithms.kernels.root_flow import (
 )
 from netkf.algorithms.models import FlowModel, RateModel, first_roots
 from netkf.engines.compiled.per_scenario import once_per_scenario
+from netkf.engines.compiled.quantiser import Quantiser
 from netkf.engines.compiled.senders import senders_of
 from netkf.linalg.arrays import FloatArray, IntArray, enlarged
 from netkf.linalg.structs import Size, Struct
@@ -257,6 +258,8 @@ class Simulation(Struct):
     link_at : the next change of a link, of those in ``ticks``
     frames, frame_at : times (F,) at which frames begin
     lives, life_at : times (K,) at which nodes go up or down
+    quantiser, clipped : how payloads are quantised, and how many numbers of the message that is
+                         being sent were clipped
     probes, probe_at : times (T,) of samples
     run, first_run : number of the present run, and of the first one
     horizon, per_second : seconds, and ticks of the time grid in a second (core.instants)
@@ -294,6 +297,7 @@ class Simulation(Struct):
     ticks: TickArrays
     frames: FloatArray
     lives: FloatArray
+    quantiser: Quantiser
     probes: FloatArray
     buffer: SampleBuffer
     rows: np.ndarray
@@ -325,6 +329,7 @@ class Simulation(Struct):
     order: int
     receivers: int
     absorbing: int
+    clipped: int
     samples: int
     horizon: float
     per_second: float
