@@ -73,7 +73,7 @@ from netkf.engines.compiled.nonlinear_samples import (
     set_pair,
 )
 from netkf.engines.compiled.outcomes import OUT_OF_RANGE
-from netkf.engines.compiled.quantiser import quantise_payload
+from netkf.engines.compiled.quantiser import clear_payload, quantise_payload
 from netkf.engines.compiled.state import AFTER_READINGS, NODES, Instants, Simulation
 from netkf.linalg.addresses import NOTHING, address_of, call_at, call_at_two, number_at
 from netkf.linalg.arrays import IntArray
@@ -373,6 +373,7 @@ def send_all(
     run.sends[0] = 1
     choose_model(state, run, verbs, h)
     if arrives and verbs.addressed == 0:
+        clear_payload(state.quantiser, m)
         call_at_two(verbs.emit, record, h, m, run)
     if verbs.decides == 1 and run.sends[0] == 0:
         release(state, m)

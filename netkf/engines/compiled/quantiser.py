@@ -120,6 +120,18 @@ def unquantised_messages(scenario: Scenario) -> str | None:
 
 
 @kernel
+def clear_payload(quantiser: Quantiser, m: int) -> None:
+    """Set the numbers of payload ``m`` to 0, of which ``emit`` may not write all: what an earlier
+    message told must not take part.
+    """
+    for f in range(len(quantiser.fields)):
+        values = struct_like(quantiser.field, quantiser.fields[f]).values
+        for e in range(values.shape[1]):
+            for q in range(values.shape[2]):
+                values[m, e, q] = 0.0
+
+
+@kernel
 def quantise_payload(quantiser: Quantiser, stream: int, m: int, q: int) -> int:
     """Replace the numbers of payload ``m`` in lane ``q`` by those that are received, with dither of
     a ``stream``; return how many were clipped.

@@ -15,7 +15,7 @@ from netkf.algorithms.kernels.gates import pass_gate
 from netkf.algorithms.kernels.nonlinear_rows import linearise_rows
 from netkf.algorithms.kernels.run import SlotRun
 from netkf.algorithms.records import Kernels
-from netkf.engines.compiled.quantiser import Quantiser, quantise_payload
+from netkf.engines.compiled.quantiser import Quantiser, clear_payload, quantise_payload
 from netkf.linalg.addresses import NOTHING, AnyStruct, address_of, call_at, call_at_two, seen_as
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
@@ -255,6 +255,7 @@ def exchange(
             run.reading = h
             choose_model(run, plan, h)
             m = h + run.first[h] if verbs.addressed == 1 else h
+            clear_payload(plan.quantiser, m)
             call_at_two(verbs.emit, record, h, m, run)
             if decides:
                 store_flags(lanes, plan.sent, b, s, e, h, load_flags(lanes, run.sends))
