@@ -38,6 +38,12 @@ from netkf.linalg.addresses import NOTHING, address_of, call_kernel, seen_as
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import LANES, MANY, aligned
 
+_UNDECIDED: dict[str, Any] = {
+    "refused": np.zeros((0,) * 4, dtype=np.uint8),
+    "speaks": np.zeros((0,) * 5, dtype=np.uint8),
+    "clipped": np.zeros((0,) * 5, dtype=np.int32),
+}
+"""Fields of a plan without gates whose messages are exact."""
 _KINDS = {"predict": PREDICT, "sense": SENSE, "exchange": EXCHANGE}
 
 
@@ -186,7 +192,7 @@ class SlotFilters:
             quantiser=self.quantiser.struct,
             start=0,
             end=0,
-            **drawn,
+            **_UNDECIDED | drawn,
         )
         setup, record, count = self._setup, self.records.struct, len(plan.sensed)
         verbs, run = self._verbs, any_slot_run(self._run)

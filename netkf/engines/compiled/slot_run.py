@@ -807,7 +807,8 @@ class SlotRuns:
             self._count_drawn(block)
         refused = times.recorded & times.sensed
         counts[:, REFUSE] += count_refusals(block.refused, refused, self.runs)
-        counts[:, CLIP] += count_clips(block.clipped, times.recorded, self.runs)
+        if block.clipped.size:
+            counts[:, CLIP] += count_clips(block.clipped, times.recorded, self.runs)
         if setup.stages.stopping >= 0:
             since = by_run(self._stopped, self.runs) - times.first
             counts[:, STOP] += ((since >= 0) & (since < times.recorded.sum())).sum(axis=1)

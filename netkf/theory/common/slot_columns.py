@@ -204,7 +204,6 @@ class SlotColumns(ErrorColumns):
             up=np.ascontiguousarray(np.broadcast_to(up[None, None, :, :, None], shape)),
             sent=sent,
             uniform=np.zeros((0,) * 5),
-            refused=np.zeros((0,) * 4, dtype=np.uint8),
             begin=WHOLE,
             stop=WHOLE,
         )
