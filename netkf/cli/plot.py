@@ -7,6 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from netkf.cli.options import print_notes
 from netkf.core.errors import ScenarioError, suggest_nearest
 from netkf.core.extras import missing
 from netkf.figures.names import FIGURE_NAMES, FIT_FIGURES, FIT_FILE, FORMATS
@@ -30,6 +31,11 @@ def _run(options: argparse.Namespace) -> int:
             results.append(read_fit(directory))
         else:
             results.append(open_directory(directory, trust=options.trust))
+    notes = [
+        f"{directory}: {result.status}; figures show what it has kept"
+        for directory, result in zip(options.directories, results, strict=True)
+        if getattr(result, "status", "") in ("failed", "interrupted")
+    ]
     # After all that can be refused: importing matplotlib takes a second.
     from netkf.figures.catalogue import plot_to_files
 
@@ -42,6 +48,7 @@ def _run(options: argparse.Namespace) -> int:
         print(*plot_to_files(together, ("error",), target, file_format))
         names = tuple(name for name in names if name != "error")
         if not names:
+            print_notes(notes)
             return 0
     for directory, result in zip(options.directories, results, strict=True):
         if options.out is None:
@@ -50,6 +57,7 @@ def _run(options: argparse.Namespace) -> int:
             out = options.out / directory.name if has_several else options.out
         for path in plot_to_files(result, names, out, file_format):
             print(path)
+    print_notes(notes)
     return 0
 
 

@@ -1,5 +1,6 @@
 """Every figure of every kind of result: drawn, within its canvas, and without overlapping text."""
 
+import dataclasses
 import itertools
 
 import matplotlib as mpl
@@ -195,7 +196,11 @@ def test_the_command_writes_files(results, tmp_path, capsys):
     assert written == [str(folder / "figures" / f"{name}.svg") for name in ("error", "age")]
     assert main(["plot", str(folder), "--figure", "links", "--out", str(tmp_path / "l.pdf")]) == 0
     assert (tmp_path / "l.pdf").read_bytes().startswith(b"%PDF")
-    capsys.readouterr()
+    assert not capsys.readouterr().err
+    failed = dataclasses.replace(run, status="failed")
+    half = netkf.save(failed, run.scenario, tmp_path / "failed")
+    assert main(["plot", str(half), "--figure", "error"]) == 0
+    assert capsys.readouterr().err == f"note: {half}: failed; figures show what it has kept\n"
     for arguments, words in (
         ([str(tmp_path)], "manifest.json is missing"),
         ([str(folder), "--figure", "eror"], 'did you mean "error"'),
