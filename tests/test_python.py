@@ -113,6 +113,9 @@ def test_a_saved_run_of_another_seed_keeps_its_random_graph(build, tmp_path):
     assert netkf.first_difference(netkf.simulate(again, replica=2), run) is None
     manifest = json.loads((folder / "manifest.json").read_text())
     assert (manifest["seed"], manifest["replica"], manifest["status"]) == (9, 2, "complete")
+    # The directory's scenario has the seed of the run.
+    copy = netkf.save(netkf.open(folder), scenario, tmp_path / "copy")
+    assert (copy / "scenario.toml").read_bytes() == (folder / "scenario.toml").read_bytes()
 
 
 def test_numbers_stand_for_matrices_of_one_entry():

@@ -289,9 +289,11 @@ def copy_file(source: Path, target: Path) -> None:
         shutil.copyfile(source, temporary)
 
 
-def scenario_digest(scenario: Scenario) -> str:
-    """Return the SHA-256 of a scenario with all defaults and its files, to know own results."""
-    digest = hashlib.sha256(to_toml(resolve_defaults(scenario)).encode())
+def scenario_digest(scenario: Scenario, **changed: Any) -> str:
+    """Return the SHA-256 of a scenario with all defaults, of which some are ``changed``, and its
+    files, to know own results.
+    """
+    digest = hashlib.sha256(to_toml(resolve_defaults(scenario) | changed).encode())
     files = {source.name: source.full for source in source_files(scenario)}
     files |= {f"{name}.py": file for name, file in find_module_files(scenario).items() if file}
     for name, file in sorted(files.items()):

@@ -147,7 +147,8 @@ def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
     require_scenario(scenario, "save", ", directory")
     directory = as_path("directory", directory)
     known = require_run(run)
-    if known is not scenario and scenario_digest(known) != scenario_digest(scenario):
+    # A run may have another seed than its scenario, which scenario.toml of a directory then has.
+    if len({scenario_digest(one, seed=run.seed) for one in {known, scenario}}) > 1:
         rule = "must be a run of this scenario: their keys or files differ"
         raise ScenarioError("run", rule, run, "save it with run.scenario")
     output = _create_output(scenario, directory, run.seed, run.replica, run.engine, tables=True)
