@@ -46,12 +46,16 @@ def parse_changes(settings: Sequence[str]) -> dict[str, Any]:
     from netkf.scenario.values import parse_value, split_setting
 
     pairs = [split_setting("--set", setting) for setting in settings]
-    changes: dict[str, Any] = {}
-    for key, text in pairs:
-        if key in changes:
-            raise ScenarioError("--set", f"gives {key} twice", text, "give each key once")
-        changes[key] = parse_value("--set", key, text)
-    return changes
+    keys = [key.replace("[", ".").replace("]", "").split(".") for key, _ in pairs]
+    # What counts is the last value of a key, and a table replaces what its keys had before.
+    lost = {
+        pairs[k][0]: pairs[m][0]
+        for m, key in enumerate(keys)
+        for k in range(m)
+        if keys[k][: len(key)] == key
+    }
+    print_notes([f"--set {late} replaces {early}, set before it" for early, late in lost.items()])
+    return {key: parse_value("--set", key, text) for key, text in pairs}
 
 
 def load_scenario(

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 from netkf.cli import pictures
 from netkf.cli.options import (
     load_scenario,
-    parse_changes,
     print_json,
     print_table_notes,
     print_title,
@@ -28,7 +27,8 @@ def _run(options: argparse.Namespace) -> int:
     from netkf.studies.parameter_grid import parse_grid
     from netkf.studies.sweep import plan_sweep, sweep_to_directory
 
-    fixed = [*parse_changes(options.set), *(["seed"] if options.seed is not None else [])]
+    fixed = [setting.partition("=")[0].strip() for setting in options.set]
+    fixed += ["seed"] if options.seed is not None else []
     grid, scenario = parse_grid(options.vary, fixed), load_scenario(options)
     draw = partial(pictures.draw_picture, pictures.SWEEP, scenario.name)
     completed: list[CompletedSweep] = []

@@ -89,19 +89,14 @@ def source_files(value: Any) -> list[SourceFile]:
 
 def change_table(table: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """Return tables with values at key paths replaced or added; raises ScenarioError for a path
-    through a value that is neither a table nor a list, and for one that replaces an earlier one.
+    through a value that is neither a table nor a list.
     """
-    set_before: list[list[str]] = []
     for path, value in changes.items():
         keys = path.replace("[", ".").replace("]", "").split(".")
         if len(keys) > MAX_DEPTH:
             raise ScenarioError(
                 path, "is not a key path of a scenario", None, "see the file's keys"
             )
-        if any(earlier[: len(keys)] == keys for earlier in set_before):
-            remedy = "give each key once, and a table before its keys"
-            raise ScenarioError(path, "replaces a value set before it", value, remedy)
-        set_before.append(keys)
         table = _set_key(table, keys, value, path)
     return table
 

@@ -396,7 +396,7 @@ def test_a_log_may_take_the_plant_of_a_scenario(tmp_path):
     changes = {"network.graph": {"kind": "complete", "nodes": 3}, "sensors": SENSORS}
     scenario = netkf.load(SCENARIOS / "poisson_ring.toml", changes)
     run = netkf.simulate(scenario.replace({"horizon": 1.0}), engine="simpy")
-    netkf.save(run, scenario, tmp_path / "run")
+    netkf.save(run, run.scenario, tmp_path / "run")
     like = tmp_path / "run" / "scenario.toml"
     out = tmp_path / "out"
     netkf.import_log(log, "csv", out, like=like)
