@@ -221,7 +221,6 @@ class Workspace:
         pool = self._pool[0]
         # All messages are free: a linked list in the order of the pool.
         pool["next"] = np.arange(1, len(pool) + 1)
-        path = draws.path(together)
         if self._scratch is None:
             self._scratch = scratch_arrays(
                 start.table, start.gains, self._unrolled, self._scenario.plant.n
@@ -251,7 +250,7 @@ class Workspace:
             waiting=self._waiting,
             instants=instants,
             sensing=draws.sensing,
-            path=path,
+            path=draws.path(together),
             ticks=window,
             ticks_stop=len(window.t),
             # Plants that change have no frames.

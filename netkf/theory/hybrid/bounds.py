@@ -53,10 +53,9 @@ def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
     The rates are the effective ones of the channel; for filters that do not communicate, and do
     not sample at random, the solution is their own covariance. That it is a bound is paper H
     Theorem 2, and docs/poisson_samples.md for sensors that sample by Poisson clocks or at known
-    times. Integrated
-    with relative tolerance 1e-10 and returned only if the defect is below that (below 1e-7 with a
-    delay or samples, or where H(12) is stiff). Raises TheoryError, with the reason, if the theorem
-    does not apply.
+    times. Integrated with relative tolerance 1e-10 and returned only if the defect is below that
+    (below 1e-7 with a delay or samples, or where H(12) is stiff). Raises TheoryError, with the
+    reason, if the theorem does not apply.
     """
     instants = as_times(times)
     if len(scenario.plant.changes):
