@@ -97,6 +97,7 @@ def copy_arrays(target: Derived, source: Derived) -> None:
 
 def struct_like(struct: Derived, memory: np.ndarray) -> Derived:
     """Return the struct of the class of ``struct`` whose block of int64 words is ``memory``
-    (words,).
+    (words,). A kernel must pass it on to one that writes into its arrays: numba removes what seems
+    to be written to values of a function's own.
     """
     return struct_at(memory, type(struct))

@@ -125,10 +125,13 @@ def clear_payload(quantiser: Quantiser, m: int) -> None:
     message told must not take part.
     """
     for f in range(len(quantiser.fields)):
-        values = struct_like(quantiser.field, quantiser.fields[f]).values
-        for e in range(values.shape[1]):
-            for q in range(values.shape[2]):
-                values[m, e, q] = 0.0
+        clear_field(struct_like(quantiser.field, quantiser.fields[f]), m)
+
+
+@kernel
+def clear_field(field: QuantisedField, m: int) -> None:
+    """Set the numbers of a field of payload ``m`` to 0."""
+    field.values[m] = 0.0
 
 
 @kernel
@@ -136,19 +139,26 @@ def quantise_payload(quantiser: Quantiser, stream: int, m: int, q: int) -> int:
     """Replace the numbers of payload ``m`` in lane ``q`` by those that are received, with dither of
     a ``stream``; return how many were clipped.
     """
-    clipped, received = 0, quantiser.received
-    step, limit, levels = quantiser.step, quantiser.range, quantiser.levels
+    clipped = 0
     for f in range(len(quantiser.fields)):
         field = struct_like(quantiser.field, quantiser.fields[f])
-        values, number, first = field.values, field.number, field.first
-        for k in range(len(first)):
-            unit = next_unit(quantiser.states, stream)
-            received[k], beyond = quantise_number(values[m, first[k], q], unit, step, limit, levels)
-            clipped += beyond
-        for e in range(len(number)):
-            if number[e] >= 0:
-                values[m, e, q] = received[number[e]]
-            else:
-                # In all lanes, also in those that are idle: hearers ask whether any has it.
-                values[m, e, :] = 0.0
+        clipped += quantise_field(quantiser, field, stream, m, q)
+    return clipped
+
+
+@kernel
+def quantise_field(quantiser: Quantiser, field: QuantisedField, stream: int, m: int, q: int) -> int:
+    """Quantise a field of payload ``m`` in lane ``q``; return how many numbers were clipped."""
+    clipped, values, received = 0, field.values, quantiser.received
+    step, limit, levels = quantiser.step, quantiser.range, quantiser.levels
+    for k in range(len(field.first)):
+        unit, value = next_unit(quantiser.states, stream), values[m, field.first[k], q]
+        received[k], beyond = quantise_number(value, unit, step, limit, levels)
+        clipped += beyond
+    for e in range(len(field.number)):
+        if field.number[e] >= 0:
+            values[m, e, q] = received[field.number[e]]
+        else:
+            # In all lanes, also in those that are idle: hearers ask whether any has it.
+            values[m, e] = 0.0
     return clipped
