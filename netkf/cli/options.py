@@ -7,6 +7,7 @@ for numpy and numba.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import sys
@@ -43,17 +44,13 @@ class Parser(argparse.ArgumentParser):
 
 def parse_changes(settings: Sequence[str]) -> dict[str, Any]:
     """Return the values of texts ``key.path=value`` by key; raises ScenarioError."""
+    from netkf.scenario.tables import replaces_key
     from netkf.scenario.values import parse_value, split_setting
 
     pairs = [split_setting("--set", setting) for setting in settings]
-    keys = [key.replace("[", ".").replace("]", "").split(".") for key, _ in pairs]
     # What counts is the last value of a key, and a table replaces what its keys had before.
-    lost = {
-        pairs[k][0]: pairs[m][0]
-        for m, key in enumerate(keys)
-        for k in range(m)
-        if keys[k][: len(key)] == key
-    }
+    both = itertools.combinations([key for key, _ in pairs], 2)
+    lost = {early: late for early, late in both if replaces_key(late, early)}
     print_notes([f"--set {late} replaces {early}, set before it" for early, late in lost.items()])
     return {key: parse_value("--set", key, text) for key, text in pairs}
 

@@ -7,12 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from netkf.cli import pictures
-from netkf.cli.options import (
-    load_scenario,
-    print_json,
-    print_table_notes,
-    print_title,
-)
+from netkf.cli.options import load_scenario, print_json, print_table_notes, print_title
 from netkf.cli.progress import ProgressLine
 from netkf.core.printable import count_phrase
 

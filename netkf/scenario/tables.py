@@ -87,12 +87,23 @@ def source_files(value: Any) -> list[SourceFile]:
     return [item for item in walk(value) if isinstance(item, SourceFile)]
 
 
+def split_path(path: str) -> list[str]:
+    """Return the keys of a path: ``sensors[0].R`` and ``sensors.0.R`` are one."""
+    return path.replace("[", ".").replace("]", "").split(".")
+
+
+def replaces_key(path: str, earlier: str) -> bool:
+    """Return True if a value at a key path replaces that of an ``earlier`` one."""
+    keys = split_path(path)
+    return split_path(earlier)[: len(keys)] == keys
+
+
 def change_table(table: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """Return tables with values at key paths replaced or added; raises ScenarioError for a path
     through a value that is neither a table nor a list.
     """
     for path, value in changes.items():
-        keys = path.replace("[", ".").replace("]", "").split(".")
+        keys = split_path(path)
         if len(keys) > MAX_DEPTH:
             raise ScenarioError(
                 path, "is not a key path of a scenario", None, "see the file's keys"

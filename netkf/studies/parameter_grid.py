@@ -16,6 +16,7 @@ import numpy as np
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import Component
 from netkf.scenario.scenario import Scenario
+from netkf.scenario.tables import replaces_key, split_path
 from netkf.scenario.values import parse_values, split_setting
 from netkf.scenario.writing import part_as_table, resolve_defaults, toml_text
 
@@ -39,18 +40,10 @@ def parse_grid(settings: Sequence[str], fixed: Iterable[str] = ()) -> dict[str, 
             _even_values(key, *evenly.groups()) if evenly else parse_values("--vary", key, text)
         )
     for key, other in itertools.product(grid, fixed):
-        if _replaces(key, other):
+        if replaces_key(key, other):
             rule = f"{key} replaces what --set or --seed gives for {other}"
             raise ScenarioError("--vary", rule, None, "leave out one of the two")
     return grid
-
-
-def _path(key: str) -> list[str]:
-    return key.replace("[", ".").replace("]", "").split(".")
-
-
-def _replaces(key: str, earlier: str) -> bool:
-    return _path(earlier)[: len(_path(key))] == _path(key)
 
 
 def _even_values(key: str, start: str, stop: str, count: str) -> list[Any]:
@@ -118,11 +111,11 @@ def _text(value: Any) -> str:
 def _require_apart(keys: list[str]) -> None:
     """Raise ScenarioError if a key sets again what an earlier one has varied."""
     for first, key in itertools.combinations(keys, 2):
-        if _replaces(key, first):
+        if replaces_key(key, first):
             rule = f"{key} replaces the values of {first}, which is varied before it"
             remedy = (
                 "vary the table first"
-                if not _replaces(first, key)
+                if not replaces_key(first, key)
                 else "give all values in one list"
             )
             raise ScenarioError("--vary", rule, None, remedy)
@@ -185,7 +178,7 @@ def is_integer_key(scenario: Scenario, key: str) -> bool:
     """Return True if ``key`` has an integer value; raises ScenarioError for no number."""
     value: Any = resolve_defaults(scenario)
     # Follow the path, such as sensors[0].R, through tables and lists.
-    for name in _path(key):
+    for name in split_path(key):
         try:
             value = value[int(name)] if isinstance(value, (list, tuple)) else value[name]
         except (KeyError, IndexError, ValueError, TypeError):
