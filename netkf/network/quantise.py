@@ -79,6 +79,12 @@ def quantise_numbers(
     return clipped
 
 
+def first_entries(numbers: IntArray) -> IntArray:
+    """Return the place (K,) of the first entry of each of K numbers, see ``Record.numbers``."""
+    number, first = np.unique(numbers, return_index=True)
+    return np.asarray(first[number >= 0])
+
+
 class Encoder:
     """Quantises the payloads of a node with the dither of its stream ``random``."""
 
@@ -108,8 +114,7 @@ class Encoder:
         """Quantise an array whose entries are these ``numbers``, see ``Record.numbers``."""
         if numbers is None or values.dtype != np.float64:
             return self.encode(values)
-        first = np.unique(numbers[numbers >= 0], return_index=True)[1]
-        sent, count = self._quantisation.apply(values[numbers >= 0][first], self._random)
+        sent, count = self._quantisation.apply(values.ravel()[first_entries(numbers)], self._random)
         return np.append(sent, 0.0)[numbers], count
 
     def _encode_array(self, values: FloatArray) -> tuple[FloatArray, int]:

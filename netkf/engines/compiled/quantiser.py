@@ -9,7 +9,7 @@ from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.generic import struct_like
 from netkf.linalg.structs import Struct
-from netkf.network.quantise import Quantisation, quantise_number
+from netkf.network.quantise import Quantisation, first_entries, quantise_number
 from netkf.rng.draws import next_unit
 from netkf.rng.streams import WIDTH, ReplicaStreams, Streams
 from netkf.scenario.scenario import Scenario
@@ -85,9 +85,8 @@ class PayloadQuantiser:
             if array.dtype == np.float64:
                 values = array.reshape(len(array), -1, array.shape[-1])
                 given = self._records.numbers.get(name, np.arange(values.shape[1])).ravel()
-                first = np.unique(given[given >= 0], return_index=True)[1]
-                first = np.flatnonzero(given >= 0)[first]
                 number = np.ascontiguousarray(given, dtype=np.int64)
+                first = first_entries(number)
                 fields.append(QuantisedField(values=values, number=number, first=first))
         self._kept = fields
         self.struct.fields = np.stack([field.memory for field in fields])

@@ -142,7 +142,7 @@ class SlotTables:
     the step ends, who absorbs), and the links that a last sample looks at.
 
     awake : (S, E, N) flags: nodes that may send, in the slots just made; empty without lives
-    speaks : (S, E, N) flags: nodes with links to send on
+    speaks : (S, E, N) flags: nodes with links to send on, where messages are of few bits
     """
 
     def __init__(self, scenario: Scenario, streams: Streams, setup: SlotSetup) -> None:
@@ -234,7 +234,8 @@ class SlotTables:
         elif times.exchanged[0]:
             # Broadcasts use all links.
             asked[:, setup.ends.ravel()] = 1
-        if self._scenario.network.quantise is not None:
+        if setup.quantise is not None:
+            # The filters are asked before the messages are made, and need to know who speaks.
             self._who_sends(times, uses)
         return np.asarray(asked * ~self._down(times)[0])
 
@@ -404,8 +405,9 @@ class SlotTables:
         if setup.may_miss:
             unread = setup.unread(times.first, len(times.start))
             sends &= ~unread[uses.slot, uses.step, sender]
-        self.speaks = np.zeros((*times.begin.shape, len(setup.nodes)), dtype=np.uint8)
-        self.speaks[uses.slot[sends], uses.step[sends], sender[sends]] = 1
+        if setup.quantise is not None:
+            self.speaks = np.zeros((*times.begin.shape, len(setup.nodes)), dtype=np.uint8)
+            self.speaks[uses.slot[sends], uses.step[sends], sender[sends]] = 1
         return np.asarray(sends)
 
     def _send(self, times: StepTimes, uses: Uses, up: np.ndarray) -> Messages:
