@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from netkf.core.csv_files import MAX_ID
 from netkf.core.errors import ScenarioError
 from netkf.core.printable import count_phrase
 from netkf.linalg.arrays import FloatArray
@@ -17,6 +18,7 @@ from netkf.logs.packets import (
     MAX_SKIP,
     PacketLog,
     choose_origin,
+    find_lead,
     find_resolution,
     parse_numbers,
     parse_stamps,
@@ -97,6 +99,9 @@ def read_tables(log: Path, columns: Mapping[str, str]) -> PacketLog:
         rule = f"{where}: is heard before it is sent"
         raise ScenarioError(str(log), rule, None, "correct the stamps; lost packets have none")
     sends, outcomes = _match(table, resolution, notes, str(log))
+    if not is_run and (first := float(sends["t"].min())) <= 0.0:  # clocks were aligned
+        sends["t"] += 1.0 - first // 1.0
+        origin -= Decimal(int(1.0 - first // 1.0))
     result = PacketLog(sends, outcomes, origin, resolution, "lost", notes, is_run=is_run)
     if is_run and (log / "ticks.csv").is_file():
         result.ticks = log / "ticks.csv"
@@ -179,10 +184,12 @@ def _read_rows(path: Path, raw: pd.DataFrame, notes: list[str]) -> _Rows:
     for name in ("number", "rssi"):
         column = names[name]
         table[name] = parse_numbers(path, raw, column, gaps=True) if column else missing
-    wrong = np.flatnonzero((table["number"] % 1.0 > 0.0) | (table["number"] < 0.0))
+    is_count = (table["number"] % 1.0 == 0.0) & table["number"].between(0.0, MAX_ID)
+    wrong = np.flatnonzero(~is_count & table["number"].notna())
     if wrong.size:
-        rule = f"line {raw.index[wrong[0]]}: number must be an integer from 0"
-        raise ScenarioError(str(path), rule, table["number"].iloc[wrong[0]], "correct the entry")
+        rule = f"line {raw.index[wrong[0]]}: number must be an integer from 0 to 2^53"
+        value = raw[names["number"]].iloc[wrong[0]]
+        raise ScenarioError(str(path), rule, value, "correct the entry, or count from less")
     table["what"], table["heard"] = _read_outcomes(path, raw, names, table)
     stamps, arrivals = parse_stamps(path, raw, names["t"], notes), _read_arrivals(path, raw, names)
     has_receiver = (table["receiver"] != "").to_numpy()
@@ -199,6 +206,8 @@ def _read_rows(path: Path, raw: pd.DataFrame, notes: list[str]) -> _Rows:
 def _find_columns(path: Path, raw: pd.DataFrame, notes: list[str]) -> dict[str, str]:
     """Return the column of each of SYNONYMS, "" if none; a node's own log gets both ends."""
     names = {name: find_column(raw, name) for name in SYNONYMS}
+    if names["node"] == "id" and names["sender"]:
+        names["node"] = ""  # it counts rows
     if names["event"] and not names["sender"] and names["node"]:
         events = raw[names["event"]].str.lower()
         is_tx = events.isin(SENT)
@@ -209,6 +218,13 @@ def _find_columns(path: Path, raw: pd.DataFrame, notes: list[str]) -> dict[str, 
     elif names["node"] and not (names["sender"] and names["receiver"]):
         # The node whose log it is: of what it sent, or of what it heard from a sender.
         names["receiver" if names["sender"] else "sender"] = names["node"]
+    elif names["node"]:
+        # Beside whose log it is the receiver is an address, such as that of all.
+        own, is_own = raw[names["node"]], raw[names["node"]] == raw[names["sender"]]
+        hearer = raw[names["receiver"]].where(is_own | (own == ""), own)
+        told = names["event"] or names["heard"]
+        raw["receiver"] = hearer if told else hearer.mask(is_own, "")
+        names["receiver"] = "receiver"
     for name in ("t", "sender"):
         if not names[name]:
             rule = f"must have a column {name} ({', '.join(SYNONYMS[name])})"
@@ -300,13 +316,13 @@ def _match(
             f"merged: stamps of {count_phrase(len(spread), 'transmission')} differ from row to "
             f"row, by {spread.max():g} s at most; the sender's or the first counts"
         )
+    _order_stamps(sends, notes)
+    sends = sends.sort_values(["t", "counter"], kind="stable")
+    spread_equal(sends, resolution, notes)
     skipped = _skipped(sends, notes)
     if len(skipped):  # an empty table has no types
         sends = pd.concat([sends, skipped])
-    sends = sends.sort_values(["t", "counter"], kind="stable")
     sends["key"] = sends.index
-    sends = sends.reset_index(drop=True)
-    spread_equal(sends, resolution, notes)
     sends = sends.sort_values(["t", "row"], kind="stable").reset_index(drop=True)
     place = pd.Series(sends.index, index=sends["key"])
     rows = table[table["what"] != "tx"].assign(send=lambda rows: rows["key"].map(place))
@@ -328,6 +344,7 @@ def _number_transmissions(table: pd.DataFrame, notes: list[str]) -> pd.Series:
     table["counter"] = 0
     wraps = restarts = missing = 0
     moduli, intervals = set(), []
+    _align_clocks(table, notes)
     for (sender, to), rows in table.groupby(["sender", "to"], sort=True):
         own = rows.sort_values(["t", "number"], kind="stable")
         known = own[own["number"].notna()]
@@ -362,6 +379,42 @@ def _number_transmissions(table: pd.DataFrame, notes: list[str]) -> pd.Series:
     return keys
 
 
+def _align_clocks(table: pd.DataFrame, notes: list[str]) -> None:
+    """Move the stamps of reports, where clocks of nodes are so far apart that numbers of a sender
+    would seem to fall, to the clock of the sender, or of the latest who reports it.
+    """
+    reports = table[table["number"].notna() & (table["what"] != "outcome")].sort_values("t")
+    who = reports["receiver"].where(reports["what"] != "tx", "")
+    moved: list[float] = []
+    for _, rows in reports.groupby(["sender", "to"], sort=True):
+        names, codes = np.unique(who[rows.index].astype(str), return_inverse=True)
+        lead = find_lead(rows["number"].to_numpy(), rows["t"].to_numpy(), codes)
+        lead -= 0.0 if names[0] == "" else lead.max()
+        if lead.any():
+            table.loc[rows.index, "t"] = (rows["t"] - lead).round(9)
+            moved.append(float(np.abs(lead).max()))
+    if moved:
+        notes.append(
+            f"moved: reports of {count_phrase(len(moved), 'sender')} by up to {max(moved):g} s: "
+            "the clocks of those who report a packet differ by so much"
+        )
+
+
+def _order_stamps(sends: pd.DataFrame, notes: list[str]) -> None:
+    """Move transmissions whose number is lower than that of an earlier one to the stamp of it."""
+    before = sends["t"].copy()
+    for _, rows in sends.groupby(["sender", "to"], sort=True):
+        if rows["counter"].is_unique:
+            order = rows.sort_values("counter", ascending=False)
+            sends.loc[order.index, "t"] = order["t"].cummin()
+    moved = before - sends["t"]
+    if moved.any():
+        notes.append(
+            f"moved: {count_phrase(int(moved.gt(0.0).sum()), 'transmission')}, by up to "
+            f"{moved.max():g} s, to the stamp of the next one of their sender, which was earlier"
+        )
+
+
 def _key(sender: object, to: object, number: object) -> str:
     return f"{sender}\n{to}\n{number}"
 
@@ -369,14 +422,15 @@ def _key(sender: object, to: object, number: object) -> str:
 def _skipped(sends: pd.DataFrame, notes: list[str]) -> pd.DataFrame:
     """Return transmissions of which only the numbers tell, at times between their neighbours."""
     found: list[dict[str, object]] = []
+    left_out = 0
     for (sender, to), rows in sends.groupby(["sender", "to"], sort=True):
         own = rows.sort_values("counter")
         counters, times = own["counter"].to_numpy(), own["t"].to_numpy()
         channels = own["channel"].tolist()
         for k in np.flatnonzero(np.diff(counters) > 1).tolist():
             count = int(counters[k + 1] - counters[k])
-            # A jump that the time does not explain is a counter that began again.
-            if count > MAX_SKIP or times[k + 1] <= times[k]:
+            if count > MAX_SKIP:
+                left_out += count - 1
                 continue
             for j in range(1, count):
                 t = times[k] + (times[k + 1] - times[k]) * j / count
@@ -388,6 +442,11 @@ def _skipped(sends: pd.DataFrame, notes: list[str]) -> pd.DataFrame:
         notes.append(
             f"not known: {count_phrase(len(found), 'transmission')} that numbers tell of and no "
             "row does; they stand between their neighbours in time"
+        )
+    if left_out:
+        notes.append(
+            f"not known: {count_phrase(left_out, 'transmission')} between numbers more than "
+            f"{MAX_SKIP:,} apart; these are not in the replay"
         )
     columns = ["sender", "t", "channel", "to", "counter", "sent", "logged"]
     keys = [_key(row["sender"], row["to"], row["counter"]) for row in found]

@@ -43,6 +43,7 @@ MAX_SECONDS = 1e11
 """Stamps from here on are hardly seconds: these would be of the year 5138."""
 YEAR_1990, YEAR_2100 = 6.3e8, 4.1e9
 """In seconds since 1970."""
+_ZONE = re.compile(r"[Tt ]\S+([Zz]|[+-]\d\d:?\d*)$")
 _DATE = re.compile(r"(\d{4}-\d\d-\d\d)_(\d\d)[.:](\d\d)[.:](\d\d)")
 
 
@@ -139,13 +140,21 @@ def parse_stamps(
     8601 times, or 2014-09-07_22.41.23. Raises ScenarioError.
     """
     base = TimeBase(_find_unit(path, table, name, notes))
-    stamps = []
+    stamps: list[Decimal] = []
+    kinds: dict[tuple[bool, bool], int] = {}
     for line, text in zip(table.index, table[name], strict=True):
         try:
             stamps.append(base.exact(_DATE.sub(r"\1T\2:\3:\4", text)))
         except ValueError:
             rule = f"line {line}: {name} must be a number or an ISO 8601 time"
             raise ScenarioError(str(path), rule, text, "correct the entry") from None
+        kinds.setdefault((":" in text, bool(_ZONE.search(text))), line)
+    if len(kinds) > 1 and notes is not None:
+        where = " and ".join(map(str, [*kinds.values()][:2]))
+        notes.append(
+            f"used: {path.name}: {name} in lines {where} is of two kinds: a number counts from "
+            "1970, and a time without a zone is one of UTC"
+        )
     return stamps
 
 
@@ -166,34 +175,93 @@ def choose_origin(stamps: list[Decimal], resolution: float) -> Decimal:
     return whole if first - whole >= Decimal(resolution) else whole - 1
 
 
+def find_lead(numbers: FloatArray, times: FloatArray, who: np.ndarray) -> FloatArray:
+    """Return how far the stamps (K,) of one sender's packets, in order of time, are ahead of those
+    by reporter 0, by what two say of one number; 0 if that is less than half of what lies between
+    packets.
+    """
+    order = np.lexsort((times, numbers))
+    t, same, by = times[order], np.diff(numbers[order]) == 0, who[order]
+    gaps = np.where(same, np.diff(t), np.inf)
+    before, after = np.append(np.inf, gaps[:-1]), np.append(gaps[1:], np.inf)
+    # Rows of one number after a wrap are further apart, one of one reporter by a cycle.
+    cycles = pd.Series(times).groupby([numbers, who]).diff()
+    cycle = float(cycles[cycles > 0.0].quantile(0.1)) if (cycles > 0.0).any() else np.inf
+    chosen = same & (by[1:] != by[:-1]) & ((gaps <= before) | (gaps <= after))
+    chosen &= gaps < 0.5 * cycle
+    low, high = np.minimum(by[1:], by[:-1])[chosen], np.maximum(by[1:], by[:-1])[chosen]
+    apart = pd.Series(np.where(by[1:] > by[:-1], 1.0, -1.0)[chosen] * gaps[chosen])
+    found = apart.groupby([low, high]).agg(["median", "size"])
+    first, second = np.array([*found.index], dtype=int).reshape(-1, 2).T
+    weights, ends = np.sqrt(found["size"].to_numpy()), np.eye(who.max() + 1)
+    design = (weights[:, None] * (ends[second] - ends[first]))[:, 1:]
+    lead = np.linalg.lstsq(design, weights * found["median"].to_numpy(), rcond=None)[0]
+    lead, most = np.append(0.0, lead), np.flatnonzero(who == np.bincount(who).argmax())
+    interval, steps = _find_interval(numbers[most], times[most]), np.diff(times)
+    is_large = 0.0 < 0.5 * interval < np.ptp(lead) >= steps.min(initial=np.inf, where=steps > 0.0)
+    return lead[who] if is_large else np.zeros(len(times))
+
+
+def _find_interval(numbers: FloatArray, times: FloatArray) -> float:
+    """Return the usual time between two packets, by the first of each stamp; 0 if none follow."""
+    first = np.flatnonzero(np.diff(times, prepend=-np.inf) > 0.0)
+    steps, gaps = np.diff(numbers[first]), np.diff(times[first])
+    forward = (steps > 0) & (steps < MAX_SKIP)
+    return float(np.median(gaps[forward] / steps[forward])) if forward.any() else 0.0
+
+
 def unwrap(numbers: np.ndarray, times: FloatArray) -> tuple[np.ndarray, int, int, int]:
     """Return counters (K,) of one sender, by ``times``, that grow on where ``numbers`` begin again;
     how often they wrapped, by which modulus, and how often they restarted.
 
     A number that falls, with successors that stay down, wrapped if the skipped numbers fit the time
-    passed, and else restarted; one that falls alone is out of order.
+    passed, and else restarted; one that falls alone, in less time, is out of order. Of one stamp
+    those come first that go on from the last.
     """
     modulus = next((m for m in MODULI if m > numbers.max(initial=0)), 0)
-    steps, gaps = np.diff(numbers), np.diff(times)
-    forward = (steps > 0) & (steps < MAX_SKIP) & (gaps > 0)
-    interval = float(np.median(gaps[forward] / steps[forward])) if forward.any() else 0.0
+    interval, gaps = _find_interval(numbers, times), np.diff(times)
+    # Where one stamp has several packets, more may have been sent since than it shows.
+    coarse = bool(((gaps == 0.0) & (np.diff(numbers) != 0)).any()) and bool((gaps > 0.0).any())
+    grain = float(gaps[gaps > 0.0].min()) if coarse else 0.0
+    ends, numbers = np.searchsorted(times, times, "right"), numbers.copy()
+    place: list[int] = []
     counters = np.empty(len(numbers), dtype=np.int64)
     offset = wraps = restarts = top = last = 0
     top_time = 0.0
-    for k, (number, time) in enumerate(zip(numbers.tolist(), times.tolist(), strict=True)):
-        expected = (time - top_time) / interval if interval and k else 0.0
-        falls = k > 0 and number < last - LATE and np.median(numbers[k : k + 8]) < last - LATE
+    for k, time in enumerate(times.tolist()):
+        if k == len(place):
+            turn = _begin_at(numbers[k : ends[k]], last - LATE if k else None, modulus)
+            place += (k + turn).tolist()
+            numbers[k : ends[k]] = numbers[k : ends[k]][turn]
+        number = int(numbers[k])
+        expected = (time + grain - top_time) / interval if interval and k else 0.0
         skipped = number + modulus - last
+        falls = k > 0 and number < last - LATE and np.median(numbers[k : k + 8]) < last - LATE
+        is_due = modulus > 0 and abs(skipped - expected) <= 1.0 + 0.25 * expected
+        falls |= k > 0 and number <= last and is_due
         if falls and modulus and skipped <= 2.0 * expected + 3.0:
             offset, wraps = offset + modulus, wraps + 1
         elif falls or (k and MAX_SKIP < number - last > 10.0 * expected and not wraps):
             offset, restarts = top + 1 - number, restarts + 1
         # One of before the wrap may come late.
         is_late = wraps and not falls and number > last + modulus / 2
-        counters[k] = number + offset - (modulus if is_late else 0)
-        if not k or counters[k] > top:
-            top, top_time, last = int(counters[k]), time, number
+        counter = number + offset - (modulus if is_late else 0)
+        counters[place[k]] = counter
+        if not k or counter > top:
+            top, top_time, last = counter, time, number
     return counters, wraps, modulus, restarts
+
+
+def _begin_at(numbers: np.ndarray, first: int | None, modulus: int) -> np.ndarray:
+    """Return the order of rising ``numbers`` of one stamp on a circle, from ``first`` on, or after
+    the widest gap.
+    """
+    if len(numbers) == 1 or not modulus:
+        return np.arange(len(numbers))
+    if first is None:
+        widest = int(np.argmax(np.diff(numbers, append=numbers[0] + modulus)))
+        first = int(numbers[(widest + 1) % len(numbers)])
+    return np.argsort((numbers - first) % modulus, kind="stable")
 
 
 def spread_equal(sends: pd.DataFrame, resolution: float, notes: list[str]) -> None:

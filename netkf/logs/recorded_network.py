@@ -88,7 +88,8 @@ def write_network(
         _begin_with(like, log)
     outcomes = settle(log, hole, unreported)
     if outcomes.empty:
-        raise ScenarioError(name, "has no packet that anybody could hear", None, "check the log")
+        rule = "must name senders, and who heard them: one receiver a row"
+        raise ScenarioError(name, rule, None, "name its column: --columns receiver=COLUMN")
     account = accounts(log.sends, outcomes)
     if like is not None and like.network.lives:
         # What comes to a node that is down is lost by its life, at that instant.
@@ -152,7 +153,9 @@ def rename_nodes(log: PacketLog) -> None:
     """Give nodes names that tables can hold: no blanks, quotes or signs of comments."""
     nodes = sorted({*log.sends["sender"], *log.outcomes["receiver"]})
     names = {node: re.sub(r"[^\w.:+-]", "_", node) for node in nodes}
-    if not all(re.fullmatch(r"\d{1,15}", node) for node in nodes):
+    if all(re.fullmatch(r"\d{1,15}", node) for node in nodes):
+        names = {node: str(int(node)) for node in nodes}  # as tables write 01
+    else:
         names = {n: f"n{name}" if _is_number(name) else name for n, name in names.items()}
     if len(set(names.values())) < len(nodes):
         names = {node: f"n{k}" for k, node in enumerate(nodes)}

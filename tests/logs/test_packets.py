@@ -161,6 +161,8 @@ def test_outcomes_events_and_repeated_rows(tmp_path, capsys):
         (["t,src,dst", "1,1,2", "x,1,2"], r"line 3: t must be a number or an ISO 8601 time"),
         (["t,src,dst,seq", "1,1,2,1.5"], r"line 2: number must be an integer"),
         (["t,src,dst,seq", "1,1,2,x"], r"line 2: seq must be a number"),
+        (["t,src,dst,seq", f"1,1,2,{2**60}"], r"line 2: number must be an integer from 0 to 2\^53"),
+        (["t,src,1,2", "1,1,1,0"], r"must name senders, and who heard them: one receiver a row"),
         (["t,src,dst,ok", "1,1,2,maybe"], r"line 2: ok must say 1 or 0"),
         (["t,dst", "1,2"], r"must have a column sender"),
         (["t,src,dst", "1,2,2"], r"line 2: sender and receiver must differ"),
@@ -210,6 +212,60 @@ def test_counters_grow_on_through_wraps_holes_and_late_rows(modulus, delivery):
     if modulus > 16 * 4:  # a hole of sixty hides whole turns of 16
         assert (np.diff(counters) == np.diff(true[order])).all()
         assert wraps == true[-1] // modulus - true[0] // modulus
+
+
+@pytest.mark.parametrize("logged", [True, False])
+@pytest.mark.parametrize(
+    ("modulus", "interval", "stamp", "lead"),
+    [(256, 0.1, 1.0, 0.0), (16, 0.1, 1.0, 0.0), (16, 10.0, 0.001, 5.0), (256, 10.0, 0.001, 48.0)],
+)
+def test_stamps_may_be_coarse_and_clocks_apart(tmp_path, modulus, interval, stamp, lead, logged):
+    """Stamps of many packets, and of clocks that are several packets apart, hide no wrap and invent
+    none; packets that nobody heard are counted, and stay in order.
+    """
+    random, ahead = (
+        np.random.default_rng(modulus),
+        {"a": 0.0, "b": -lead, "c": 0.5 * lead, "d": lead},
+    )
+    rows, true = [], {}
+    for k in range(600):
+        for place, i in enumerate(ahead):
+            t = 1000.0 + interval * (k + 0.2 * place)
+            what = [("tx", i, "")] if logged else []
+            for j in ahead:
+                if j != i:
+                    # Receivers' logs begin and end with what everybody heard.
+                    true.setdefault((i, j), []).append(k in (0, 599) or random.random() < 0.7)
+                    what += [("rx", j, j)] if true[i, j][-1] else []
+            for event, node, j in what:
+                shown = np.floor((t + ahead[node]) / stamp + 1e-6) * stamp
+                rows.append(f"{shown:.3f},{event},{i},{j},{k % modulus}")
+    random.shuffle(rows)
+    log = write(tmp_path / "log.csv", ["t,event,src,dst,seq", *rows])
+    netkf.import_log(log, "csv", tmp_path / "out", unreported="lost", hole=1e9)
+    outcomes = table(tmp_path / "out", "outcomes.csv").groupby(["sender", "receiver"])["delivered"]
+    assert {link: own.tolist() for link, own in outcomes} == true
+    sent = table(tmp_path / "out", "transmissions.csv").groupby("node")["t"]
+    assert all(own.is_unique for _, own in sent)
+
+
+def test_what_a_receiver_was_off_for_is_no_silence(tmp_path):
+    rows = ["t,src,dst,seq", *(f"{k},1,2,{k}" for k in range(3000) if not 500 < k < 2500)]
+    _, notes = netkf.import_log(write(tmp_path / "log.csv", rows), "csv", tmp_path / "out")
+    assert any("1,999 transmissions between numbers more than 1,000 apart" in n for n in notes)
+
+
+def test_a_node_that_logs_what_was_sent_to_an_address_heard_it(tmp_path):
+    rows = ["t,node,src,dst,seq,id"]
+    for k in range(40):
+        rows += [f"{k},1,1,255,{k},{3 * k}", f"{k},02,1,255,{k},{3 * k + 1}"]
+        rows += [f"{k},2,1,255,{k},{3 * k + 2}"] * (k % 2)
+    netkf.import_log(write(tmp_path / "log.csv", rows), "csv", tmp_path / "out")
+    accounts = table(tmp_path / "out", "accounts.csv")
+    assert accounts.to_numpy()[:, 2:].tolist() == [[40, 40, 0, 0], [40, 20, 20, 0]]
+    # 02 and 2 are two nodes here, and would be one in a table.
+    run = netkf.simulate(netkf.load(tmp_path / "out" / "scenario.toml"))
+    assert (len(run.nodes), run.count("deliver"), run.count("lost")) == (3, 60, 20)
 
 
 def test_counters_begin_again():
@@ -410,6 +466,7 @@ def test_the_origin_and_decimals_of_stamps_are_kept(tmp_path):
     _, notes = netkf.import_log(write(tmp_path / "a.csv", rows), "csv", tmp_path / "out")
     assert f"origin: simulated 0 is {Decimal(1577836800)} in the log" in notes
     assert "used: nodes have other names here: x y is x_y" in notes
+    assert any("time in lines 2 and 3 is of two kinds" in note for note in notes)
     sent = table(tmp_path / "out", "transmissions.csv")
     assert sent.to_numpy().tolist() == [[0.25, "x_y"], [1.5, "x_y"]]
 
