@@ -22,7 +22,7 @@ from netkf.algorithms import single
 from netkf.algorithms.models import first_root, sample_update
 from netkf.algorithms.records import Kernels
 from netkf.algorithms.traits import Analysis, Needs, Timing, Weights
-from netkf.core.fields import Component
+from netkf.core.fields import Component, stated
 from netkf.core.places import Key
 from netkf.linalg.arrays import FloatArray
 
@@ -232,6 +232,15 @@ class Filter(Component):
 
     kernels: ClassVar[Kernels | None] = None
     _called_if = MappingProxyType({"emit": "timing.talks", "absorb": "timing.talks"})
+    _values = MappingProxyType(
+        {
+            "timing": stated(Timing),
+            "needs": stated(Needs),
+            "link_weights": stated(Weights),
+            "analysis": stated(Analysis),
+            "kernels": stated(Kernels, optional=True),
+        }
+    )
 
     @property
     def timing(self) -> Timing:

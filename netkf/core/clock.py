@@ -6,12 +6,13 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.core.errors import ScenarioError
-from netkf.core.fields import Component
+from netkf.core.errors import ScenarioError, errors_under, quote
+from netkf.core.fields import Component, boolean, number, stated
 from netkf.core.laws import EXPONENTIAL, Lattice, WaitingLaw
 from netkf.linalg.arrays import FloatArray
 
@@ -33,6 +34,10 @@ class Clock(Component):
     The caller owns the random generator of each entity, so that the ticks of an entity depend on
     nothing but its own stream.
     """
+
+    _values = MappingProxyType(
+        {"memoryless": boolean, "gaps": stated(WaitingLaw, Lattice, optional=True)}
+    )
 
     @abstractmethod
     def ticks(
@@ -89,6 +94,15 @@ class ClockPosition(NamedTuple):
     now: float = 0.0
 
 
+def stated_rate(clock: Clock, entity: Entity, key: str) -> float:
+    """Return ``clock.mean_rate``; ScenarioError at ``key`` unless it is at least 0 or nan."""
+    rate: Any = clock.mean_rate(entity)
+    if not (isinstance(rate, float) and (rate >= 0.0 or math.isnan(rate))):
+        with errors_under(key):
+            rate = float(number(low=0.0)(f"{type(clock).__name__}.mean_rate", rate))
+    return float(rate)
+
+
 def next_ticks(
     clock: Clock,
     entity: Entity,
@@ -103,7 +117,12 @@ def next_ticks(
     Raises ScenarioError at ``key`` if time does not advance: the run would never end.
     """
     now = position.now
-    times = np.asarray(clock.ticks(entity, *position, random, count), dtype=np.float64)
+    given = clock.ticks(entity, *position, random, count)
+    times = np.asarray(given)
+    if times.ndim != 1 or (len(times) and times.dtype.kind not in "fiu"):
+        rule = f"{type(clock).__name__}.ticks must return a vector of times, not {quote(given)}"
+        raise ScenarioError(key, rule)
+    times = times.astype(np.float64, copy=False)
     if len(times) and not (times[-1] > now and times[0] >= now and (np.diff(times) >= 0.0).all()):
         owner = {1: "node", 2: "link"}.get(len(entity), "entity")
         rule = f"{type(clock).__name__}: ticks of {owner} {list(entity)} must increase, "

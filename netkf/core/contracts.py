@@ -290,6 +290,9 @@ def _watched(cls: type, own: FunctionType, contract: FunctionType) -> Any:
         if length and not (isinstance(result, tuple) and len(result) == length):
             rule = f"must return a tuple of {length}, not {quote(result)}"
             raise ContractError(f"{describe_method(cls, own)} {rule}")
+        if length and result[0] is None:
+            rule = f"must return a value before the others, not {quote(result)}"
+            raise ContractError(f"{describe_method(cls, own)} {rule}")
         return result
 
     return watched

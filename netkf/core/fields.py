@@ -102,6 +102,8 @@ class Component:
     """Keys in files of fields whose names differ, since Python reserves these words."""
     _called_if: ClassVar[Mapping[str, str]] = {}
     """Methods of a contract that are called only where another member is True."""
+    _values: ClassVar[Mapping[str, Rule]] = {}
+    """The rules of members of a contract that are values, which users' classes may override."""
 
     def __new__(cls, *values: Any, **named: Any) -> Self:
         """Return a new object; raises ScenarioError for settings without a name that must have one,
@@ -145,6 +147,12 @@ class Component:
     def __hash__(self) -> int:
         """Return a hash that equal components share: values may be arrays, which have none."""
         return hash((type(self), len(dataclasses.fields(self))))
+
+
+def check_values(part: Component) -> None:
+    """Raise ScenarioError for a value that a user's class states and that breaks its rule."""
+    for name, rule in part._values.items():
+        rule(f"{type(part).__name__}.{name}", getattr(part, name))
 
 
 def walk(value: Any) -> Iterator[Any]:
@@ -363,6 +371,13 @@ def instance_of(*classes: type) -> Rule:
         f"a{'n' if cls.__name__[0] in 'AEIO' else ''} {cls.__name__.lower()}" for cls in classes
     )
     return Rule(f"must be {names}", convert, 'write a table { kind = "...", ... }')
+
+
+def stated(*classes: type, optional: bool = False) -> Rule:
+    """Return the rule for what a class states as an object of one of the ``classes``, or None."""
+    names = " or ".join(cls.__name__ for cls in classes) + " or None" * optional
+    convert = instance_of(*classes, *[type(None)] * optional).convert
+    return Rule(f"must be {names}", convert, "see netkf.parts")
 
 
 def one_of(*names: str) -> Rule:

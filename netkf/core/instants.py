@@ -97,8 +97,9 @@ def as_fraction(value: float) -> Fraction | None:
     """Return the rational number that a finite ``value`` stands for: a short decimal number as it
     is written, else the fraction of small numbers that it is up to rounding; None if neither.
     """
-    decimal = Fraction(repr(value))
-    if len(repr(value).partition("e")[0].replace(".", "").strip("-0")) <= SHORT:
+    text = repr(float(value))
+    decimal = Fraction(text)
+    if len(text.partition("e")[0].replace(".", "").strip("-0")) <= SHORT:
         return decimal
     fraction = decimal.limit_denominator(MAX_DENOMINATOR)
     return fraction if abs(fraction - decimal) <= CLOSE * abs(decimal) else None

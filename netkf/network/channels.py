@@ -16,6 +16,7 @@ from netkf.network.delays import (
     NoDelay,
     checked_delay,
     delay_depends_on_message,
+    draw_delay,
     draw_delays,
 )
 from netkf.network.graphs import Link, Topology
@@ -28,6 +29,8 @@ from netkf.network.losses import (
     delivery_probabilities,
     has_conditions,
     identical_per_link,
+    next_state,
+    stated_delivery,
 )
 from netkf.network.scheduled import Hopping
 from netkf.rng.streams import Streams
@@ -69,7 +72,7 @@ class Channel(Component):
         if sent.frames > 1 and (self.loss.stateful or self.channels is not None):
             return math.nan
         factor = 1.0 if self.channels is None else self.channels.mean(sent.link)
-        mean: float = (self.loss.mean_delivery(sent) * factor) ** sent.frames
+        mean: float = (stated_delivery(self.loss, sent) * factor) ** sent.frames
         return mean
 
     def deliveries(self, sent: Transmission) -> FloatArray:
@@ -126,8 +129,8 @@ class BroadcastSampler:
         if self._state_random is not None:
             bad = np.zeros(count, dtype=bool)
             for k in range(count):
-                self._bad = bad[k] = self._loss.next_state(
-                    self._link, self._bad, self._state_random
+                self._bad = bad[k] = next_state(
+                    self._loss, self._link, self._bad, self._state_random
                 )
         return BroadcastDraw(uniform, bad)
 
@@ -238,9 +241,9 @@ class ChannelSampler:
         if self._loss_random is not None:
             uniform = float(self._loss_random.random())
         if self._state_random is not None:
-            self._bad = bad = self._loss.next_state(self._link, self._bad, self._state_random)
+            self._bad = bad = next_state(self._loss, self._link, self._bad, self._state_random)
         if self._delay_random is not None:
-            delay = self._delay.draw(self._delay_random)
+            delay = draw_delay(self._delay, self._delay_random)
         return ChannelDraw(uniform, bad, delay)
 
     def draws(self, count: int) -> tuple[FloatArray, np.ndarray, FloatArray]:
@@ -252,8 +255,8 @@ class ChannelSampler:
             uniform = self._loss_random.random(count)
         if self._state_random is not None:
             for k in range(count):
-                self._bad = bad[k] = self._loss.next_state(
-                    self._link, self._bad, self._state_random
+                self._bad = bad[k] = next_state(
+                    self._loss, self._link, self._bad, self._state_random
                 )
         if self._delay_random is None:
             return uniform, bad, np.full(count, self._fixed_delay)

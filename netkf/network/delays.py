@@ -6,15 +6,36 @@ import math
 from abc import abstractmethod
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
-from netkf.core.errors import ScenarioError
-from netkf.core.fields import Component, field, number, of_time, positive
+from netkf.core.errors import ScenarioError, errors_under
+from netkf.core.fields import (
+    Component,
+    Rule,
+    boolean,
+    either,
+    field,
+    number,
+    of_time,
+    positive,
+    stated,
+)
 from netkf.core.laws import WaitingLaw, exponential_law, lognormal_law, uniform_law
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Topology
 from netkf.network.losses import Transmission
+
+_SECONDS = number(low=0.0)
+
+
+def _is_none(value: object) -> bool:
+    return value is None
+
+
+def _is_infinite(value: object) -> bool:
+    return isinstance(value, float) and value == math.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,6 +43,14 @@ class Delay(Component):
     """The contract of a delay model."""
 
     _called_if = MappingProxyType({"draw": "is_random"})
+    _values = MappingProxyType(
+        {
+            "fixed": either(_SECONDS, Rule("must be None", lambda value: value), _is_none),
+            "longest": either(_SECONDS, Rule("must be inf", float), _is_infinite),
+            "is_random": boolean,
+            "law": stated(WaitingLaw, optional=True),
+        }
+    )
 
     @abstractmethod
     def draw(self, random: np.random.Generator) -> float:
@@ -156,7 +185,16 @@ def draw_delays(delay: Delay, random: np.random.Generator, count: int) -> FloatA
         return delay.mean * random.standard_exponential(count)
     if type(delay) is UniformDelay:
         return delay.low + (delay.high - delay.low) * random.random(count)
-    return np.array([delay.draw(random) for _ in range(count)])
+    return np.array([draw_delay(delay, random) for _ in range(count)])
+
+
+def draw_delay(delay: Delay, random: np.random.Generator) -> float:
+    """Return ``delay.draw`` in seconds; raises ScenarioError unless it is at least 0."""
+    seconds: Any = delay.draw(random)
+    if not (isinstance(seconds, float) and seconds >= 0.0):
+        with errors_under("network.channel.delay"):
+            seconds = float(_SECONDS(f"{type(delay).__name__}.draw", seconds))
+    return float(seconds)
 
 
 def delay_depends_on_message(delay: Delay) -> bool:
@@ -166,7 +204,10 @@ def delay_depends_on_message(delay: Delay) -> bool:
 
 def checked_delay(delay: Delay, sent: Transmission, drawn: float) -> float:
     """Return the seconds that ``sent`` takes, nan if lost; raises ScenarioError if negative."""
-    seconds = delay.message_delay(sent, drawn)
+    seconds: Any = delay.message_delay(sent, drawn)
+    if not isinstance(seconds, float):  # a float32 would make times of its precision
+        with errors_under("network.channel.delay"):
+            seconds = float(number()(f"{type(delay).__name__}.message_delay", seconds))
     if seconds < 0.0:
         rule = (
             f"{type(delay).__name__}: the delay of message {sent.number} on link "
@@ -175,4 +216,4 @@ def checked_delay(delay: Delay, sent: Transmission, drawn: float) -> float:
         )
         remedy = "correct message_delay of the class"
         raise ScenarioError("network.channel.delay", rule, seconds, remedy)
-    return seconds
+    return float(seconds)

@@ -16,7 +16,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from netkf.core.csv_files import read_columns
-from netkf.core.errors import ScenarioError
+from netkf.core.errors import ScenarioError, errors_under, quote
 from netkf.core.fields import (
     Component,
     Rule,
@@ -29,6 +29,7 @@ from netkf.core.fields import (
     positive,
     probability,
     source_file,
+    stated,
 )
 from netkf.core.laws import Chain
 from netkf.core.repeated_rows import RowUse, count_rows, first_rows
@@ -79,6 +80,15 @@ class Loss(Component):
     """
 
     _called_if = MappingProxyType({"next_state": "stateful"})
+    _values = MappingProxyType(
+        {
+            **dict.fromkeys(("vectorised", "follows_distance", "deterministic"), boolean),
+            **dict.fromkeys(("stateful", "independent"), boolean),
+            "fate_share": probability,
+            "state_of": one_of("link", "sender"),
+            "chain": stated(Chain, optional=True),
+        }
+    )
 
     @abstractmethod
     def delivery_probability(self, sent: Transmission) -> Any:
@@ -564,12 +574,29 @@ def _is_vectorised(loss: Loss) -> bool:
     return bool(loss.vectorised) and says <= defines
 
 
+def next_state(loss: Loss, link: Link, before: bool | None, random: np.random.Generator) -> bool:
+    """Return ``loss.next_state``; raises ScenarioError unless it is True or False."""
+    bad: Any = loss.next_state(link, before, random)
+    if not isinstance(bad, bool | np.bool_):
+        rule = f"{type(loss).__name__}.next_state must return True or False, not {quote(bad)}"
+        raise ScenarioError("network.channel.loss", rule)
+    return bool(bad)
+
+
+def stated_delivery(loss: Loss, sent: Transmission) -> float:
+    """Return ``loss.mean_delivery``; raises ScenarioError unless it is a probability or nan."""
+    mean: Any = loss.mean_delivery(sent)
+    if isinstance(mean, float) and math.isnan(mean):
+        return math.nan
+    with errors_under("network.channel.loss"):
+        return float(probability(f"{type(loss).__name__}.mean_delivery", mean))
+
+
 def delivery_probabilities(loss: Loss, sent: Transmission) -> FloatArray:
     """Return checked probabilities (K,) of messages ``sent`` on a link; raises ScenarioError."""
     if _is_vectorised(loss):
-        values = np.broadcast_to(loss.delivery_probability(sent), np.shape(sent.number))
-        demand_probability(loss, sent, values)
-        return np.asarray(values)
+        values = demand_probability(loss, sent, loss.delivery_probability(sent))
+        return np.broadcast_to(values, np.shape(sent.number))
     columns = np.broadcast_arrays(sent.number, sent.time, sent.bad, sent.distance)[1:]
     rows = zip(sent.number.tolist(), *(c.tolist() for c in columns), strict=True)
     ones = (
@@ -581,22 +608,32 @@ def delivery_probabilities(loss: Loss, sent: Transmission) -> FloatArray:
 
 def checked_delivery_probability(loss: Loss, sent: Transmission) -> float:
     """Return the probability that ``sent`` arrives; raises ScenarioError outside [0, 1]."""
-    value: float = loss.delivery_probability(sent)
-    if not 0.0 <= value <= 1.0:
-        demand_probability(loss, sent, np.array(value))
-    return value
+    value = loss.delivery_probability(sent)
+    is_right = isinstance(value, float) and 0.0 <= value <= 1.0 and not loss.deterministic
+    return value if is_right else float(demand_probability(loss, sent, value))
 
 
-def demand_probability(loss: Loss, sent: Transmission, values: FloatArray) -> None:
-    """Raise ScenarioError unless the probabilities of messages ``sent`` on a link are in [0, 1]."""
+def demand_probability(loss: Loss, sent: Transmission, given: Any) -> FloatArray:
+    """Return the probabilities of messages ``sent`` on a link; raises ScenarioError unless they are
+    numbers in [0, 1], and 0 or 1 if the loss is deterministic.
+    """
+    values = np.asarray(given)
+    if values.dtype.kind not in "fiub" or values.shape not in ((), np.shape(sent.number)):
+        rule = f"must return a number, not {quote(given)}"
+        raise ScenarioError(
+            "network.channel.loss", f"{type(loss).__name__}.delivery_probability {rule}"
+        )
     is_right = (values >= 0.0) & (values <= 1.0)
+    text = "in [0, 1]"
+    if is_right.all() and loss.deterministic:
+        is_right, text = (values == 0.0) | (values == 1.0), "0 or 1 where deterministic is True"
     if is_right.all():
-        return
+        return np.asarray(values, dtype=np.float64)
     wrong = np.flatnonzero(~is_right)
     number = np.ravel(sent.number)[wrong[0]]
     rule = (
         f"{type(loss).__name__}: the delivery probability of message {number} on link "
-        f"{list(sent.link)} must be in [0, 1]"
+        f"{list(sent.link)} must be {text}"
     )
     remedy = "correct delivery_probability of the class"
     if isinstance(loss, KernelLoss):

@@ -6,12 +6,23 @@ import copy
 from abc import abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from netkf.core.errors import ScenarioError, errors_under
-from netkf.core.fields import Component, covariance, field, instance_of, list_of, text, vector
+from netkf.core.fields import (
+    Component,
+    boolean,
+    covariance,
+    field,
+    instance_of,
+    integer,
+    list_of,
+    text,
+    vector,
+)
 from netkf.core.instants import OnGrid, TimeGrid
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import noise_root, product
@@ -29,6 +40,10 @@ class Plant(Component, OnGrid):
     methods of plants return is the state without it. ``states`` are the names and ``units`` the
     units of its n components, for figures and pages.
     """
+
+    _values = MappingProxyType(
+        {"n": integer(1), **dict.fromkeys(("is_random", "truth_known", "linear"), boolean)}
+    )
 
     is_random: ClassVar[bool] = True
     """True if runs draw the state from the model; else the model is what the filters assume of a

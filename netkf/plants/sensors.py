@@ -16,6 +16,7 @@ from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 import numpy as np
@@ -51,6 +52,8 @@ class Sensor(Component):
     """The contract of sensors: each of ``nodes`` has one, with independent noise; ``fault`` says
     when and how it is bad, which filters do not know.
     """
+
+    _values = MappingProxyType(dict.fromkeys(("is_random", "linear", "varying"), boolean))
 
     is_random: ClassVar[bool] = True
     """True if runs draw the readings from H and R; else H and R are what filters assume of readings

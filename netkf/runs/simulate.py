@@ -13,6 +13,7 @@ from netkf.engines.base import Engine, Progress, silent
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.linalg.plain import is_plain
 from netkf.rng.streams import Streams
+from netkf.runs.failures import explain_failures
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import MemorySink, Recorder, Sink
 from netkf.trace.run import Run
@@ -74,15 +75,17 @@ def simulate(
     ``seed`` is that of the scenario if None; runs with the same seed differ by ``replica``.
     Additional ``sinks`` receive the same events and samples during the run.
 
-    Raises EngineError if no engine can run the scenario, ScenarioError for bad arguments.
+    Raises EngineError if no engine can run the scenario or a user's class fails, ScenarioError for
+    bad arguments.
     """
     require_scenario(scenario, "simulate")
     seed = scenario.seed if seed is None else integer(low=0)("seed", seed)
     replica = integer(low=0)("replica", replica)
-    chosen_engine = choose_engine(engine, scenario)
     memory = MemorySink()
     recorder = Recorder([memory, *sinks])
-    status = chosen_engine.run(scenario, Streams(seed, replica), recorder, progress)
+    with explain_failures(scenario):
+        chosen_engine = choose_engine(engine, scenario)
+        status = chosen_engine.run(scenario, Streams(seed, replica), recorder, progress)
     return collect_run(scenario, memory, recorder, seed, replica, chosen_engine.name, status)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from netkf.algorithms.filter import compiled_kernels
 from netkf.algorithms.kernels.gains import longest_interval
 from netkf.algorithms.kernels.run import absorb as nothing
+from netkf.core.clock import stated_rate
 from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.fields import Component
 from netkf.linalg.spectra import growth_rate
@@ -389,7 +390,7 @@ def _check_ticks(scenario: DerivedScenario) -> None:
     assert isinstance(clock, LinkClock)
     owner = clock.at.removesuffix("s")  # "link", "direction" or "node"
     for entity in clock.entities(scenario.topology):
-        ticks = clock.mean_rate(entity) * scenario.horizon
+        ticks = stated_rate(clock, entity, "network.activation") * scenario.horizon
         if ticks > MAX_TICKS:
             ids = entity[0] if len(entity) == 1 else entity
             raise ScenarioError(

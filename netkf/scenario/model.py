@@ -20,6 +20,7 @@ from netkf.core.fields import (
     SourceFile,
     array,
     boolean,
+    check_values,
     covariance,
     definite_covariance,
     either,
@@ -67,6 +68,7 @@ from netkf.scenario.block_sensors import (
 )
 from netkf.scenario.metrics import Metrics
 from netkf.scenario.names import bind_names
+from netkf.scenario.plugins import user_components
 from netkf.scenario.positions import placed_nodes, positions_of, table_of_positions
 from netkf.scenario.stamps import Time, restamp
 from netkf.scenario.time_grid import choose_grid, snap_limits
@@ -239,6 +241,8 @@ class ScenarioModel(Component):
         ScenarioError. Plant and sensors of blocks become those of the stacked state.
         """
         super().__post_init__()
+        for part in user_components(self):
+            check_values(part)
         for name in ("plants", "plant", "sensors", "network", "filter"):
             with errors_under(name):
                 restamped = restamp(getattr(self, name), self.time.stamps)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.core.clock import Clock
+from netkf.core.clock import Clock, stated_rate
 from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.places import Place
 from netkf.linalg.arrays import FloatArray
@@ -181,7 +181,7 @@ def _check_clock(scenario: ScenarioModel, key: str, sensor: LinearSensor | Nonli
         rule = "belongs to network.activation"
         raise ScenarioError(f"{key}.sampling.at", rule, getattr(clock, "at", None), "remove it")
     for node in sensor.nodes:
-        count = clock.mean_rate((node, 0)) * scenario.horizon
+        count = stated_rate(clock, (node, 0), f"{key}.sampling") * scenario.horizon
         if count > MAX_SAMPLES:
             raise ScenarioError(
                 f"{key}.sampling",

@@ -9,8 +9,10 @@ from functools import cached_property
 from typing import Any
 
 from netkf.algorithms.kernels.maps import METHODS
+from netkf.core.errors import NetkfError, ScenarioError
 from netkf.scenario.checks import check_scenario
 from netkf.scenario.derived import DerivedScenario
+from netkf.scenario.plugins import explain_user_error
 from netkf.scenario.records import record_notes
 from netkf.scenario.sampling import sampling_notes
 from netkf.scenario.stamps import stamp_notes
@@ -41,8 +43,16 @@ class Scenario(DerivedScenario):
     """
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        check_scenario(self)
+        try:
+            super().__post_init__()
+            check_scenario(self)
+        except (NetkfError, OSError):
+            raise
+        except Exception as error:
+            rule = explain_user_error(self, error)
+            if rule is None:
+                raise
+            raise ScenarioError("", rule, None, "correct the class or its settings") from error
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the fields and the topology, whose file may not exist where this is loaded."""

@@ -33,6 +33,7 @@ from netkf.testing.noise import demand_agreement, family_level
 from netkf.testing.watching import (
     OTHER_GENERATOR,
     WatchedPart,
+    checker,
     demand_kind,
     guard_user_code,
     is_number,
@@ -58,6 +59,7 @@ the end in seconds of a run that shows all delays.
 """
 
 
+@checker
 def check_channel(channel: Any, /, topology: Topology | None = None, **settings: Any) -> None:
     """Check a Channel, a Loss or a Delay, or a class of these with its ``settings``.
 
@@ -223,7 +225,7 @@ def _check_delivery_probabilities(watched: WatchedPart, one: Transmission) -> No
             is_sure = not part.deterministic or probability in (0.0, 1.0)
             watched.demand(method, is_sure, rule, probability, remedy)
     mean = watched.call("mean_delivery", one)
-    is_mean = math.isnan(mean) or 0.0 <= mean <= 1.0
+    is_mean = is_number(mean) and (math.isnan(mean) or 0.0 <= mean <= 1.0)
     watched.demand("mean_delivery", is_mean, "must be a number from 0 to 1, or nan", mean)
 
 
@@ -370,6 +372,9 @@ def _draw(watched: WatchedPart, random: RecordingGenerator) -> float:
     rule, remedy = "must be a finite number of at least 0 seconds", "shift or clip the law"
     is_right = is_number(seconds) and 0.0 <= seconds < math.inf
     watched.demand("draw", is_right, rule, seconds, remedy)
+    longest = watched.part.longest
+    rule, remedy = f"must be at most `longest`, {longest:g} seconds", "state a longer one"
+    watched.demand("draw", seconds <= longest, rule, seconds, remedy)
     is_fixed, got = fixed is None or seconds == fixed, f"{fixed} for {seconds}"
     watched.demand("fixed", is_fixed, "must be what draw returns, or None", got)
     return float(seconds)

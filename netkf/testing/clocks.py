@@ -37,6 +37,7 @@ from netkf.testing.noise import demand_agreement, family_level
 from netkf.testing.watching import (
     OTHER_GENERATOR,
     WatchedPart,
+    checker,
     demand,
     demand_kind,
     demand_vector,
@@ -59,6 +60,7 @@ INTERLEAVED_TICKS = 40
 STATE_IT = "define mean_rate and memoryless too if it differs by design"
 
 
+@checker
 def check_clock(clock: Any, /, link: Link | None = None, **settings: Any) -> None:
     """Check a link clock, or a class with its ``settings``.
 

@@ -13,13 +13,14 @@ from netkf.linalg.arrays import FloatArray
 from netkf.testing.observed import Seen
 from netkf.testing.parents import check_parent
 from netkf.testing.small_runs import run, setups
-from netkf.testing.watching import WatchedPart, demand_kind, is_number, make_part
+from netkf.testing.watching import WatchedPart, checker, demand_kind, is_number, make_part
 
 MAX_DEGREE = 8  # weights are checked for all pairs of degrees up to it
 SHIFT_TOLERANCE = 1e-9  # relative to the estimates before the shift is subtracted
 PHASES = ("predict", "sense", "exchange")
 
 
+@checker
 def check_filter(filter: Any, /, same_as_parent: bool | None = None, **settings: Any) -> None:
     """Check a filter, or a class with its ``settings``, against its contract.
 

@@ -17,6 +17,7 @@ from netkf.testing.noise import demand_agreement, family_level
 from netkf.testing.watching import (
     OTHER_GENERATOR,
     WatchedPart,
+    checker,
     demand,
     demand_array,
     demand_kind,
@@ -29,6 +30,7 @@ from netkf.testing.watching import (
 SLOTS, REPEATED_SLOTS, RUN, MAX_LAG = 20_000, 200, 50, 3  # RUN: slots that count as one run
 
 
+@checker
 def check_matching(matching: Any, /, topology: Topology | None = None, **settings: Any) -> None:
     """Check a slot activation, or a class with its ``settings``.
 

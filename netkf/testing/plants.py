@@ -33,6 +33,7 @@ from netkf.testing.noise import (
 from netkf.testing.watching import (
     ROUNDING,
     WatchedPart,
+    checker,
     demand,
     demand_array,
     demand_close,
@@ -60,6 +61,7 @@ GAPS = (0.7, 0.2, 1.0, 0.05)
 """Gaps between the times of a path, in units of the time constant of the plant."""
 
 
+@checker
 def check_plant(plant: Any, /, **settings: Any) -> None:
     """Check a plant, or a class with its ``settings``.
 

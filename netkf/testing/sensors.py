@@ -32,6 +32,7 @@ from netkf.testing.noise import (
 from netkf.testing.watching import (
     ROUNDING,
     WatchedPart,
+    checker,
     demand,
     demand_array,
     demand_close,
@@ -59,6 +60,7 @@ CUTS: tuple[tuple[float, ...], ...] = ((), (0.3,), (0.2, 0.65), (0.9,))
 """Shares of a step at which increments are cut; steps take these entries in turn."""
 
 
+@checker
 def check_sensor(sensor: Any, /, **settings: Any) -> None:
     """Check a sensor, or a class with its ``settings``.
 

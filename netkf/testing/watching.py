@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import dataclasses
+import functools
 import inspect
 import pickle
 import random
@@ -11,15 +12,14 @@ import struct
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import cache, cached_property
 from operator import attrgetter
 from typing import Any, NoReturn, cast
 
 import numpy as np
 
 from netkf.core.contracts import ContractError
-from netkf.core.errors import NetkfError, quote
-from netkf.core.fields import Component
+from netkf.core.errors import NetkfError, ScenarioError, quote
+from netkf.core.fields import Component, check_values
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.plugins import describe_error, describe_failure
 from netkf.testing.generators import RecordingGenerator
@@ -58,7 +58,7 @@ def demand_kind(name: str, value: object, kind: type) -> None:
 
 def is_number(value: Any) -> bool:
     """Return True for a number of Python or numpy, not for an array or text."""
-    return isinstance(value, (int, float, np.floating))
+    return isinstance(value, (int, float, np.floating)) and not isinstance(value, bool)
 
 
 def make_part(
@@ -80,15 +80,25 @@ def make_part(
     demand(not missing, name, f"must define {', '.join(missing)}", remedy="write what is missing")
     if not isinstance(part, type):
         demand(not settings, name, "settings go with a class", sorted(settings), "leave them out")
-        return part
+        return _with_values(part)
     try:
-        return cls(**settings)
+        part = cls(**settings)
     except ContractError as error:
         raise AssertionError(str(error)) from None
     except Exception as error:
         text = f"could not be made with the settings {dict(settings)!r}"
         remedy = "hand over an object, or the class with its settings as keywords"
         fail(name, text, describe_error(error), remedy)
+    return _with_values(part)
+
+
+def _with_values(part: Any) -> Any:
+    """Return ``part``; raises AssertionError for a value of it that its contract does not allow."""
+    try:
+        check_values(part)
+    except ScenarioError as error:
+        raise AssertionError(str(error)) from None
+    return part
 
 
 _PLAIN = frozenset((str, bytes, bool, int, float, complex, type(None)))
@@ -148,7 +158,7 @@ def differing_path(one: Leaves, other: Leaves) -> str | None:
         second = other[path]
         # Arrays were copied, so that only numbers and texts can be the same object.
         if value is not second and not _are_equal(np.asarray(value), np.asarray(second)):
-            return path or "it"
+            return path or "value"
     return None
 
 
@@ -184,7 +194,7 @@ def _python_generator() -> Any:
     return cast(Any, random.getstate).__self__
 
 
-@cache
+@functools.cache
 def _python_state_address() -> int | None:
     header, size = object.__basicsize__, random.Random.__basicsize__
     if sys.implementation.name != "cpython" or size < header + MERSENNE_BYTES:
@@ -194,7 +204,7 @@ def _python_state_address() -> int | None:
     return address if random.getstate()[1] == (*words, position) else None
 
 
-@cache
+@functools.cache
 def _static_attribute(cls: type, name: str) -> Any:
     return inspect.getattr_static(cls, name, None)
 
@@ -234,7 +244,7 @@ class WatchedPart:
         demand(path is None, where, rule, remedy=remedy)
         result_leaves = [collect_leaves(result) for result in results]
         path = differing_path(result_leaves[0], result_leaves[-1])
-        got = f"another {(path or '').lstrip('.') or 'value'} at the second call"
+        got = f"another {(path or 'value').removeprefix('.')} at the second call"
         remedy = "use no randomness, clock or memory of earlier calls"
         demand(path is None, where, "must return the same for the same arguments", got, remedy)
         self._results.append((where, results[0], result_leaves[0]))
@@ -250,7 +260,7 @@ class WatchedPart:
         attributes = {
             name: value
             for name, value in vars(self.part).items()
-            if not isinstance(_static_attribute(cls, name), cached_property)
+            if not isinstance(_static_attribute(cls, name), functools.cached_property)
         }
         return {path.strip("[]'"): leaf for path, leaf in collect_leaves(attributes).items()}
 
@@ -329,6 +339,17 @@ class _UncheckedPart(WatchedPart):
         return self._call_method(f"{self.name}.{method}", method, arguments)
 
 
+def checker(check: Callable[..., None]) -> Callable[..., None]:
+    """Return a checker whose every failure is an AssertionError of one line."""
+
+    @functools.wraps(check)
+    def checked(part: Any, /, *arguments: Any, **settings: Any) -> None:
+        with guard_user_code((part if isinstance(part, type) else type(part)).__name__):
+            check(part, *arguments, **settings)
+
+    return checked
+
+
 @contextmanager
 def guard_user_code(where: str) -> Iterator[None]:
     """Turn exceptions into an AssertionError of one line; refuse use of global generators."""
@@ -352,6 +373,8 @@ def demand_array(
     where: str, name: str, value: Any, shape: tuple[int, ...], remedy: str = ""
 ) -> FloatArray:
     """Return ``value`` as an array; AssertionError unless float64, finite and of ``shape``."""
+    rule = f"{name} must be an array of numpy"
+    demand(isinstance(value, np.ndarray | np.generic), where, rule, value)
     array = np.asarray(value)
     demand(array.shape == shape, where, f"{name} must have the shape {shape}", str(array.shape))
     demand(array.dtype == np.float64, where, f"{name} must be float64", str(array.dtype))

@@ -10,6 +10,7 @@ import textwrap
 from dataclasses import dataclass
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 import netkf
@@ -86,6 +87,12 @@ MISTAKES = {
                                     r"F\.emit \(FILE, line 6\) must return a tuple of 2, not State"),
     "estimate returns nothing": ("FILTER", f"def estimate(self, state): pass\n{SAME}",
                                  rf"F\.estimate \(FILE, line 6\) {NO_RESULT}"),
+    "estimate returns a column": ("FILTER", f"def estimate(self, state): return state.xhat[:, None], None\n{SAME}",
+                                  r"F failed after estimate \(FILE, line 6\) returned .*: xhat must be numbers of the "
+                                  r"shape \(1,\); got float64 of the shape \(1, 1\)"),
+    "emit returns no state": ("FILTER", f"def emit(self, state, exchange): return None, state.xhat\n{SAME}",
+                              r"F\.emit \(FILE, line 6\) must return a value before the others, not \(None, "),
+    "a timing that is a table": ("FILTER", f"timing = {{'talks': True}}\n{SAME}", r"F\.timing: must be Timing; got \{"),
     "weight fails": ("FILTER", f"def weight(self, *degrees): return 1 / 0\n{WEIGHTS}",
                      r"F failed in weight: ZeroDivisionError.*; FILE, line 6"),
     "weight is a text": ("FILTER", f"def weight(self, *degrees): return 'x'\n{WEIGHTS}",
@@ -122,6 +129,22 @@ MISTAKES = {
                    r"F failed in draw: ZeroDivisionError.*; FILE, line 6"),
     "draw takes nothing": ("DELAY", "def draw(self): return 1.0",
                            r"F\.draw \(FILE, line 6\) must take \(.+\), not \(\)"),
+    "draw is negative": ("DELAY", "def draw(self, random): return -1.0",
+                         r"delay\.F\.draw: must be a finite number at least 0; got -1\.0"),
+    "draw is not a number": ("DELAY", "def draw(self, random): return float('nan')", r"F\.draw: must be a finite .*got nan"),
+    "a fixed delay that is a text": ("DELAY", "fixed = '0.5'\ndef draw(self, random): return 0.5",
+                                     r"F\.fixed: must be a finite number at least 0, or None; got '0\.5'"),
+    "a share beyond 1": ("LOSS", "fate_share = 1.5", r"F\.fate_share: must be a finite number .*; got 1\.5"),
+    "a state of nobody": ("LOSS", "state_of = 'node'", r'F\.state_of: must be one of "link", "sender"; got .node'),
+    "a complex probability": ("LOSS", "def delivery_probability(self, sent): return 0.5 + 0.0j",
+                              r"loss: F\.delivery_probability must return a number, not \(0\.5\+0j\)"),
+    "a deterministic half": ("LOSS", "deterministic = True", r"must be 0 or 1 where deterministic is True; got 0\.5"),
+    "a state that is a number": ("LOSS", "stateful = True\ndef next_state(self, link, bad, random): return 0.3",
+                                 r"F\.next_state must return True or False, not 0\.3"),
+    "a negative rate": ("CLOCK", "def mean_rate(self, entity): return -1.0",
+                        r"activation\.F\.mean_rate: must be a finite number at least 0; got -1\.0"),
+    "complex ticks": ("CLOCK", "def ticks(self, entity, origin, index, now, random, count): return np.array([1j])",
+                      r"activation: F\.ticks must return a vector of times, not \["),
     "a plant returns no truth": ("PLANT", "def sampled_truth(self, *arguments): pass",
                                  rf"F\.sampled_truth \(FILE, line 6\) {NO_RESULT}"),
     "a misspelled verb": ("FILTER", f"def upate(self, state, reading): return state\n{SAME}",
@@ -208,9 +231,58 @@ def test_one_line_names_class_method_file_and_line(name, tmp_path, monkeypatch, 
             lines = [line for line in printed.splitlines() if "compiling" not in line]
             assert len(lines) == 1, printed
             assert re.search(pattern, lines[0]), lines[0]
+            if "mean_delivery" not in body:  # a summary asks for it, after the run
+                with pytest.raises(netkf.NetkfError, match=pattern):
+                    netkf.simulate(netkf.load("own.toml"), engine=engine)
             if "must define" in words or "must take" in words:
                 with pytest.raises(netkf.ScenarioError, match=pattern):
                     netkf.load("own.toml")
+
+
+@dataclass(frozen=True, eq=False)
+class Odd(parts.Bernoulli):
+    def mean_delivery(self, sent):
+        return 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Skew(parts.Filter):
+    def absorb(self, state, messages, exchange):
+        return state
+
+    def estimate(self, state):
+        return state.xhat, state.root @ state.root.T + np.triu(np.ones((2, 2)), 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Half(parts.Delay):
+    def draw(self, random):
+        return np.float32(0.5)
+
+
+plant = {"kind": "linear", "F": [[0.9]], "Q": [[1.0]], "period": 1.0}
+network = {"graph": {"kind": "path", "nodes": 2}, "activation": {"kind": "broadcast"}}
+
+
+def test_what_only_theory_asks_for_is_held_to_its_rule(ring):
+    scenario = ring.replace({"network.channel.loss": Odd(0.5)})
+    with pytest.raises(netkf.ScenarioError, match=r"loss\.Odd\.mean_delivery: must be .*got 2\.0"):
+        netkf.theory.assumptions(scenario)
+
+
+def test_a_covariance_that_is_not_symmetric_ends_a_run(ring):
+    with pytest.raises(
+        netkf.EngineError, match=r"Skew failed after estimate .* P must be symmetric"
+    ):
+        netkf.simulate(ring.replace({"filter": Skew()}))
+
+
+def test_float32_delays_are_numbers_in_both_engines(build):
+    scenario = build(plant=plant, network=network, filter={"kind": "diffusion"}, probe=1.0)
+    scenario = scenario.replace({"network.channel.delay": Half()})
+    one, other = (netkf.simulate(scenario, engine=engine) for engine in ("simpy", "compiled"))
+    assert one.events.equals(other.events)
+    assert (one.events.kind == "deliver").any()
 
 
 CHECKERS = {"FILTER": check_filter, "LOSS": check_channel, "CLOCK": check_clock,

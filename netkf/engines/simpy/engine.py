@@ -244,7 +244,7 @@ class _Simulation:
         if reach is not None and now < scenario.horizon:
             reach.look_at_all(int(when) if scenario.slotted else None, now)
         # By identity: a pooled filter is asked once, and its estimate serves all nodes.
-        estimate_by_state = {id(n): n.algorithm.estimate(n.state) for n in distinct(nodes)}
+        estimate_by_state = {id(n): n.estimate() for n in distinct(nodes)}
         estimates = [estimate_by_state[id(nodes[node])] for node in scenario.nodes]
         # The trace has absolute states. Adding the origin loses digits, so the error is computed
         # from local ones.

@@ -41,6 +41,19 @@ Sample = tuple[FloatArray, Any, FloatArray]
 """A sample y (p,), its H (p, n), or a function that linearises it, and R (p, p)."""
 
 
+ASYMMETRY = 1e-6
+"""The tolerated difference of P and P', as a share of its largest entry."""
+
+
+def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
+    """Return ``value`` as a new array; ValueError unless of real numbers and of the ``shape``."""
+    array = np.array(value)
+    if array.dtype.kind not in "fiu" or array.shape != shape:
+        got = f"{array.dtype} of the shape {array.shape}"
+        raise ValueError(f"{name} must be numbers of the shape {shape}; got {got}")
+    return array.astype(np.float64, copy=False)
+
+
 class Envelope(NamedTuple):
     """A message under way.
 
@@ -216,6 +229,21 @@ class Node:
             self.model.move_to(start)
         self.state = self.algorithm.predict(self.state, gap)
 
+    def estimate(self) -> tuple[FloatArray, FloatArray | None]:
+        """Return copies of the estimate (n,) and its covariance (n, n), None if it has none; raises
+        ValueError if the filter gives others.
+        """
+        xhat, P = self.algorithm.estimate(self.state)
+        mean = _numbers("xhat", xhat, (self.width,))
+        if P is None:
+            return mean, None
+        cov = _numbers("P", P, (self.width, self.width))
+        if (cov != cov.T).any():
+            asymmetry, size = np.abs(cov - cov.T).max(), np.abs(cov).max()
+            if asymmetry > ASYMMETRY * size:
+                raise ValueError(f"P must be symmetric; got P - P' of up to {asymmetry:.3g}")
+        return mean, cov
+
     def put(self, envelope: Envelope) -> None:
         """Put a message into the inbox; with ``newest_only`` the newest of a sender replaces
         others.
@@ -277,7 +305,7 @@ class Node:
         functions = [sample for sample in samples if not isinstance(sample[1], np.ndarray)]
         if not functions:
             return samples
-        xhat, P = self.algorithm.estimate(self.state)
+        xhat, P = self.estimate()
         if not self._points.distance:
             return [
                 (y, H, R) if isinstance(H, np.ndarray) else (*H(y, xhat), R) for y, H, R in samples
@@ -310,7 +338,7 @@ class Node:
 
     def _gate_factor(self, sample: Sample, time: float, peer: int, recorder: Recorder) -> float:
         """Return by what the gate multiplies R of a sample of ``peer`` (id, -1: its own)."""
-        xhat, P = self.algorithm.estimate(self.state)
+        xhat, P = self.estimate()
         y, H, R = sample
         present = np.isfinite(y) if len(y) == len(H) else np.zeros(len(H), dtype=bool)
         z, J, C = (y - H @ xhat)[present], H[present], R[np.ix_(present, present)]
