@@ -49,7 +49,7 @@ from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.scenario.records import nodes_with_law
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.increments import integration_steps
-from netkf.theory.errors import ErrorLaw, diagonal_blocks, error_law
+from netkf.theory.errors import ErrorLaw, diagonal_blocks, error_law, require_errors
 from netkf.trace.nees import BLUR, errors
 from netkf.trace.run import Run, blurred_samples
 
@@ -221,10 +221,14 @@ def _variance_floor(scenario: Scenario) -> float:
 
 
 def few_errors(scenario: Scenario) -> Assumption:
-    """Return the assumption that all nodes have at most MAX_ERRORS errors together at one time."""
+    """Return the assumption that events give the law of errors, of at most MAX_ERRORS at a time."""
     size = len(scenario.nodes) * scenario.width
-    evidence = f"{size} errors of all nodes together, at most {MAX_ERRORS}"
-    return Assumption("exact errors are within reach", "netkf", size <= MAX_ERRORS, evidence)
+    holds, evidence = size <= MAX_ERRORS, f"{size} errors of all nodes, at most {MAX_ERRORS}"
+    try:
+        require_errors(scenario)
+    except TheoryError as error:
+        holds, evidence = False, str(error)
+    return Assumption("exact errors are within reach", "netkf", holds, evidence)
 
 
 def whiten_errors(

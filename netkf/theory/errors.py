@@ -148,6 +148,11 @@ def _require_known_errors(scenario: Scenario, run: Run) -> None:
         )
     if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
         raise TheoryError("the run is of another scenario: its nodes or its state differ")
+    require_errors(scenario)
+
+
+def require_errors(scenario: Scenario) -> None:
+    """Raise TheoryError if events do not give the covariance of errors, of whatever filter."""
     require_linear(scenario, accepted=(RIGHT_CLOCKS, ALL_READ))
     in_python = takes_columns(scenario.node_filter) or not has_columns(scenario)
     reasons = [evidence for _, evidence in scenario.departures]
@@ -156,7 +161,7 @@ def _require_known_errors(scenario: Scenario, run: Run) -> None:
     if reasons and (in_python or scenario.views is not None):
         rule = "exact errors are known of filters whose verbs are affine kernels of one state"
         raise TheoryError(f"{reasons[0]}: {rule}; {CONSISTENCY}")
-    if scenario.links_follow_state:
+    if scenario.links_follow_state and scenario.node_filter.timing.talks:
         raise TheoryError("the true state says who hears whom: events tell of it")
 
 

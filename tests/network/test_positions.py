@@ -433,6 +433,13 @@ def test_theory_promises_nothing_of_links_that_move(tmp_path):
     assert coupled.links_follow_state
     with pytest.raises(TheoryError, match="events tell of it"):
         error_covariance(coupled, netkf.simulate(coupled))
+    # No number of runs decides such rows. A filter that does not talk has the law of its samples.
+    table = netkf.check(coupled, runs=10, workers=1).table.set_index("promise")
+    rows = table[table.index.str.contains("errors have|P is at least|P follows")]
+    assert set(rows["verdict"]) == {"not promised"}
+    alone = coupled.replace({"filter": {"kind": "local"}})
+    run = netkf.simulate(alone)
+    np.testing.assert_allclose(error_covariance(alone, run), run.P, rtol=1e-9, atol=1e-12)
 
 
 def place(rows_, **more):
