@@ -198,3 +198,32 @@ def test_refusals_do_not_wait_for_matplotlib(tmp_path):
     )
     assert done.stdout.split("\n") == ["2"] * len(refused) + ["[]", ""]
     assert len(done.stderr.splitlines()) == len(refused)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["sweep", RING, "--vary", "seed=1,2", "--slurm"], "--slurm: means nothing without --plan"),
+        (["sweep", RING, "--vary", "seed=1,2", "--tasks", "3"], "--tasks: means nothing without"),
+        (["plan", RING, "--runs", "2", "--time", "1h"], "--time: means nothing without --slurm"),
+        (["check", RING, "--most", "50"], "--most: means nothing without --until"),
+        (["plot", "run", "--format", "svg", "--out", "a.png"], "--format: is not that of a.png"),
+        (["import", ".", "--kind", "mrclam", "--hole", "5", "--out", "x"], "are of packet logs"),
+        (
+            ["size", RING, "--out", "x"],
+            "netkf size: unrecognized arguments: --out x; see netkf size",
+        ),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(tmp_path, capsys, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    if words[0] == "size":
+        words = [*words, "--vary", "seed=1:2", "--target", "worst_rms<=1"]
+    try:
+        status = main(words)
+    except SystemExit as end:
+        status = end.code
+    error = capsys.readouterr().err
+    assert (status, error.count("\n")) == (2, 1)
+    assert message in error
+    assert not list(tmp_path.iterdir())

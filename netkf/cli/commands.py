@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
-from netkf.core.errors import quote
+from netkf.core.errors import ScenarioError, quote
 from netkf.core.printable import MAX_NAME, MAX_RUNS
 from netkf.figures.names import FIGURE_NAMES, FIT_FIGURES, FORMATS
 
@@ -19,6 +19,8 @@ ONE_THREAD = ("check", "work", "merge")
 """Commands whose last digits must not depend on whether a run is simulated here or in a worker
 process, whose LAPACK has one thread.
 """
+BESIDE = (("tasks", "plan"), ("slurm", "plan"), ("time", "slurm"), ("most", "until"))
+"""Options that mean nothing without another one, of commands that have both."""
 WORKERS_PER_CORE = 8  # more processes only fill the memory
 
 
@@ -58,6 +60,10 @@ class Command(NamedTuple):
 
     def run(self, options: argparse.Namespace) -> int:
         """Run the command with the parsed options; return the exit status."""
+        for name, other in BESIDE:
+            if getattr(options, name, None) and not getattr(options, other, True):
+                remedy = f"add --{other}, or leave it out"
+                raise ScenarioError(f"--{name}", f"means nothing without --{other}", None, remedy)
         if self.name in ONE_THREAD:
             from netkf.ensembles.process_start import limit_blas_threads
 
@@ -240,13 +246,12 @@ TRACE = _option(
     default="first",
 )
 ARRAY = (
-    _option("--tasks", "number of jobs of the plan", type=parse_count, default=64),
+    _option("--tasks", "number of jobs of the plan (default: 64)", type=parse_count),
     _flag("--slurm", "print a submission script for an array of SLURM jobs on the plan"),
     _option(
         "--time",
         "time limit of each job in that script, such as 1h or 01:00:00 (default: 1h)",
         type=parse_duration,
-        default="1h",
         metavar="DURATION",
     ),
 )

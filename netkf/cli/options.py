@@ -34,6 +34,13 @@ class Parser(argparse.ArgumentParser):
         print(f"{self.prog}: {shorten(message, 1000)}; see {self.prog} --help", file=sys.stderr)
         raise SystemExit(2)
 
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Refuse unknown arguments where the command is known."""
+        known, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return known, unknown
+
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         """Raise ArgumentError if a value is not one of the choices, suggesting the nearest one."""
         if action.choices is not None and value not in action.choices:

@@ -37,6 +37,7 @@ exit $status
 # When all are done: {merge}
 # It lists the jobs whose runs are missing; sbatch --array=3,7-9 submits those of a list again.
 """
+TASKS = 64
 MARGIN = 2
 """Minutes of a job that are left for its start, and for the end of its last block."""
 
@@ -47,7 +48,7 @@ def _run(options: argparse.Namespace) -> int:
     from netkf.runs.directory_lock import lock_directory
 
     scenario = load_scenario(options)
-    tasks = min(options.tasks, options.runs)
+    tasks = min(options.tasks or TASKS, options.runs)
     with lock_directory(options.out):
         settings = EnsembleOptions(options.engine, options.trace)
         directory = plan_ensemble(scenario, options.runs, options.out, settings, tasks)
@@ -72,7 +73,7 @@ def print_plan(
 def _array(directory: Path, name: str, tasks: int, options: argparse.Namespace) -> str:
     """Return the submission script of an array of ``tasks`` SLURM jobs on a plan."""
     trust = ["--trust"] if options.trust else []
-    minutes = max(1, round(options.time / 60))
+    minutes = max(1, round((options.time or 3600) / 60))
     limit = f"{max(1, minutes - MARGIN)}m"
     return ARRAY.format(
         name="".join(c if c.isalnum() or c in "-_." else "-" for c in f"netkf-{name}")[:100],

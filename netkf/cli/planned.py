@@ -37,7 +37,7 @@ WAIT_SECONDS = 2.0
 
 def plan_study(run: Run, options: argparse.Namespace) -> int:
     """Write the plan of the study that ``run`` does with these options; return the exit status."""
-    from netkf.cli.plan import print_plan
+    from netkf.cli.plan import TASKS, print_plan
     from netkf.ensembles.parts import Worker
     from netkf.ensembles.planned_study import PlannedStudy
     from netkf.ensembles.plans import write_study
@@ -57,7 +57,7 @@ def plan_study(run: Run, options: argparse.Namespace) -> int:
     with lock_directory(options.plan, must_be_empty=True, option="--plan"):
         gaps = _missing_runs(run, options, PlannedStudy(options.plan, Worker(None), returns=False))
         runs = [gap.runs for gap in gaps]
-        tasks = min(options.tasks, max(runs, default=1))
+        tasks = min(options.tasks or TASKS, max(runs, default=1))
         write_study(options.plan, options.loaded, options.arguments, sum(runs), tasks)
     what = count_phrase(sum(runs), "run")
     if len(runs) > 1:
@@ -189,7 +189,7 @@ def _study_options(plan: Plan, given: argparse.Namespace) -> argparse.Namespace:
         rule = "holds a plan of no study"
         raise ScenarioError("DIR", rule, str(plan.directory), "write the plan again")
     options.copy, options.trust = plan.directory / "scenario.toml", given.trust
-    options.plan = None
+    options.plan = options.tasks = options.slurm = options.time = None
     if getattr(given, "no_plot", False) and hasattr(options, "no_plot"):
         options.no_plot = True
     return options

@@ -10,6 +10,7 @@ from typing import Any
 from netkf.cli.options import print_notes
 from netkf.core.errors import ScenarioError, suggest_nearest
 from netkf.core.extras import missing
+from netkf.core.printable import shorten
 from netkf.figures.names import FIGURE_NAMES, FIT_FIGURES, FIT_FILE, FORMATS
 
 
@@ -22,6 +23,10 @@ def _run(options: argparse.Namespace) -> int:
     names = tuple(name for text in options.figure for name in _figure_names(text))
     has_several = len(options.directories) > 1
     if options.out is not None:
+        suffix = options.out.suffix.removeprefix(".").lower()
+        if options.format and suffix in FORMATS and suffix != options.format:
+            rule = f"is not that of {shorten(options.out)}"
+            raise ScenarioError("--format", rule, options.format, "leave one of them out")
         _check_output(options.out, 1 if names == ("error",) else len(options.directories))
     results: list[Any] = []
     for directory in options.directories:

@@ -56,6 +56,9 @@ def import_log(
             raise ScenarioError(key, rule, value, "choose one of them")
     if columns and kind != "csv":
         raise ScenarioError("columns", "are those of kind csv", kind, "leave them out")
+    if kind == "mrclam" and (like, unreported, hole) != (None, "unknown", HOLE):
+        keys = "like, unreported and hole"
+        raise ScenarioError(keys, "are of packet logs", kind, "leave them out")
     if not log.exists():
         raise ScenarioError(str(log), "does not exist", None, "check the path")
     files: Files = {}

@@ -161,6 +161,8 @@ def read_source(
     label, text = str(directory), (directory / "scenario.toml").read_text(encoding="utf-8")
     if len(text) > MAX_TEXT:
         text = f"{text[:MAX_TEXT]}\n# ({len(text):,} characters)"
+    if replica is not None and not isinstance(stored, StoredRun | StoredEnsemble):
+        raise ScenarioError(shorten(label), "holds no replica", replica, "leave out --replica")
     if isinstance(stored, StoredSweep):
         return ReportSource(label, stored.manifest, stored.scenario, text, sweep=stored)
     if isinstance(stored, StoredComparison):

@@ -180,7 +180,8 @@ def _filter_legend(
     runs = f"{count_phrase(comparison.runs, 'run')} of each on the same draws"
     lines.append(f"{runs}; +-: one standard error; differences from {shorten(ran[0].filter)}, run")
     lines.append(
-        f"by run; * for certain, all marks together at confidence {comparison.confidence:g}"
+        "by run, +- half of their intervals; *: 0 is outside, all marks together at confidence "
+        f"{comparison.confidence:g}"
     )
     lines.append("worst instant: largest error of any node at any sample; traffic of replica 0")
     if has_ages:

@@ -201,6 +201,7 @@ def test_the_command_line_prints_a_table_a_document_and_a_directory(file, tmp_pa
         "gossip: cannot run here",
         "consistency",
         "of intermittent are predictions",
+        "by run, +- half of their intervals",
     ):
         assert words in text
     assert {f.name for f in out.iterdir()} == {
