@@ -274,7 +274,7 @@ def run_tests(
     """Return a test of each assumption, the shared fate, the correlation time in packets, and the
     edges of windows of time in which quality hardly changes.
     """
-    constancy = stats.test_constancy(outcomes, stats.correlation_time(outcomes))
+    constancy = stats.test_constancy(outcomes)
     edges = stats.choose_windows(outcomes) if constancy.p < MAYBE else np.empty(0)
     # Slow changes are neither bursts nor shared fate.
     steady = stats.split_at(outcomes, edges)

@@ -190,26 +190,31 @@ def counts_in(outcomes: Outcomes, edges: FloatArray) -> np.ndarray:
 
 
 def choose_windows(outcomes: Outcomes) -> FloatArray:
-    """Return the edges (K - 1,) of the 2^j windows of time that tell best of slow changes (AIC)."""
+    """Return the edges (K - 1,) of windows of time, each of which parts what stood undivided best:
+    by more than chance would at any of its places.
+    """
     t = np.concatenate([group.t for group in outcomes.groups])
-    z = np.concatenate([group.residuals.sum(axis=1) for group in outcomes.groups])
+    order = np.argsort(t, kind="stable")
+    z = np.concatenate([group.residuals.sum(axis=1) for group in outcomes.groups])[order]
     size = np.concatenate(
         [np.isfinite(g.x) @ np.nan_to_num(g.mean * (1.0 - g.mean)) for g in outcomes.groups]
-    )
-    best, edges = 0.0, np.empty(0)
-    fast = correlation_time(split_at(outcomes, np.quantile(t, np.arange(1, BLOCKS) / BLOCKS)))
-    spread = fast * float((z**2).sum() / max(size.sum(), 1e-300))
-    count = 2
-    while count <= min(BLOCKS, len(t) / (MIN_PACKETS * len(outcomes.groups))):
-        inner = np.quantile(t, np.arange(1, count) / count)
-        window = np.searchsorted(inner, t, side="right")
-        sums, sizes = np.bincount(window, z, count), np.bincount(window, size, count)
-        gain = float((sums**2 / np.maximum(sizes, 1e-300)).sum()) / spread
-        gain -= 2.0 * (count - 1)
-        if gain > best:
-            best, edges = gain, inner
-        count *= 2
-    return edges
+    )[order]
+    spread = fast_time(outcomes, BLOCKS) * float((z**2).sum() / max(size.sum(), 1e-300))
+    sums, sizes = (np.append(0.0, np.cumsum(part)) for part in (z, size))
+    least, need = MIN_PACKETS * len(outcomes.groups), 2.0 * math.log(len(t)) * spread
+    edges, open_parts = [], [(0, len(t))]
+    while open_parts:
+        a, b = open_parts.pop()
+        k = np.arange(a + least, b - least + 1)
+        if not len(k):
+            continue
+        (s, S), (n, N) = ((part[k] - part[a], part[b] - part[a]) for part in (sums, sizes))
+        apart = (s * N - S * n) ** 2 / np.maximum(n * (N - n) * N, 1e-300)
+        best = int(np.argmax(apart))
+        if apart[best] > need:
+            edges.append(t[order[k[best] - 1 : k[best] + 1]].mean())
+            open_parts += [(a, int(k[best])), (int(k[best]), b)]
+    return np.sort(edges)
 
 
 def binomial_interval(
@@ -268,14 +273,21 @@ def _unbroken(follows: np.ndarray, lag: int) -> np.ndarray:
 
 def correlation_time(outcomes: Outcomes) -> float:
     """Return 1 + 2 sum of autocorrelations, cut at noise: packets for one independent packet."""
-    total = 1.0
+    total = 0.0
     longest = max(len(group.t) for group in outcomes.groups)
     for lag in range(1, longest // 4):
         units, scale = autocorrelation(outcomes, lag)
         if scale <= 0.0 or units.sum() < 2.0 * math.sqrt(long_run_sum(units, 0)):
             break
-        total += 2.0 * float(units.sum() / scale)
-    return total
+        # The mean of correlated packets takes more than that of independent ones.
+        total, taken = total + 2.0 * float(units.sum() / scale), 2.0 * lag / longest
+    return 1.0 + (total / (1.0 - taken) if total else 0.0)
+
+
+def fast_time(outcomes: Outcomes, parts: int) -> float:
+    """Return the correlation time within so many parts of the log: slow changes are not seen."""
+    t = np.concatenate([group.t for group in outcomes.groups])
+    return correlation_time(split_at(outcomes, np.quantile(t, np.arange(1, parts) / parts)))
 
 
 def test_time(outcomes: Outcomes) -> Test:
@@ -384,8 +396,9 @@ def _shrinkage(outcomes: Outcomes) -> float:
     return max(0.0, 1.0 - noise / between) if between > 0.0 else 0.0
 
 
-def test_constancy(outcomes: Outcomes, time: float) -> Test:
+def test_constancy(outcomes: Outcomes) -> Test:
     """Test by correlations of BLOCKS means that deliveries do not change slowly."""
+    time = fast_time(outcomes, 3 * LAGS)
     name, what = "quality does not change in time", "deviation of delivery over time"
     t = np.concatenate([group.t for group in outcomes.groups])
     z = np.concatenate([group.residuals.sum(axis=1) for group in outcomes.groups])

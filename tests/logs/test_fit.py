@@ -29,9 +29,11 @@ from tests.conftest import SCENARIOS
 LEVEL = 0.05
 
 
-def drawn(random, T=150, share=0.0, chain=None, p=0.8, senders=3, hearers=3, wave=0.0):
+def drawn(
+    random, T=150, share=0.0, chain=None, p=0.8, senders=3, hearers=3, wave=0.0, steps=(0.0,)
+):
     """Outcomes of broadcasts by a law: share of one fate, a chain (to_bad, to_good, good, bad), one
-    delivery p or one for each link, and a wave of it over time.
+    delivery p or one for each link, and a wave of it over time, or steps of it.
     """
     groups, links = [], []
     deliveries = np.broadcast_to(p, (senders, hearers))
@@ -41,6 +43,7 @@ def drawn(random, T=150, share=0.0, chain=None, p=0.8, senders=3, hearers=3, wav
         uniform, one = random.random((T, hearers)), random.random(T) < share
         uniform[one] = random.random((one.sum(), 1))
         q = deliveries[s] + wave * np.sin(6.0 * math.pi * np.arange(T) / T)[:, None]
+        q += np.array(steps)[np.arange(T) * len(steps) // T, None]
         if chain is not None:
             to_bad, to_good, good, bad = chain
             state, q = random.random(hearers) < to_bad / (to_bad + to_good), np.empty((T, hearers))
@@ -127,7 +130,20 @@ def test_slow_changes_are_found():
     assert 0.05 < tests["constancy"].estimate < 0.15  # 0.15 / sqrt 2 = 0.106
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize("steps", [(0.0, -0.6, 0.0), (0.0, -0.85), (0.0, -0.25, 0.0)])
+def test_however_large_a_change_is_it_is_no_burst_and_no_shared_fate(steps):
+    """The larger it is, the longer outcomes are correlated; its edges are windows' edges."""
+    found, other = [], []
+    for random in seeds(12, 8):
+        tests, *_, edges = run_tests(drawn(random, T=400, p=0.9, steps=steps), None)
+        found.append(tests["constancy"].p < LEVEL)
+        other += [tests[name].p < LEVEL for name in ("time", "fate")]
+        true = 400.0 * np.arange(1, len(steps)) / len(steps)
+        assert np.abs(edges[:, None] - true).min(axis=0).max() < 12.0
+    assert all(found)
+    assert rate(other) < binomial_range(24, LEVEL)[1]
+
+
 @pytest.mark.slow
 def test_slow_changes_are_neither_bursts_nor_shared_fate():
     """Few true assumptions are rejected; without windows most would be."""
