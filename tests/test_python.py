@@ -274,14 +274,17 @@ def test_arguments_of_a_wrong_kind_are_one_line(odd, ring):
         lambda value: np.repeat(value, 2, axis=0)[::2],
         lambda value: np.array(value, dtype=object),
         lambda value: [np.array(row) for row in value],
+        lambda value: np.array(value, dtype=float),
+        lambda value: [[np.array(number) for number in row] for row in value],
     ],
-    ids=["pandas", "float32", "strided", "objects", "rows"],
+    ids=["pandas", "float32", "strided", "objects", "rows", "floats", "no dimensions"],
 )
 def test_arrays_of_every_kind_are_lists(kind, ring):
     matrices = {
         "plant.A": [[0.0, 1.0], [-1.0, 0.125]],
         "sensors[0].R": [[0.25]],
         "filter.cov": [[1.0, 0.0], [0.0, 1.0]],
+        "network.activation.rates": [[0, 1, 3.0], [1, 2, 4.0]],
         "network.graph": [[0, 1], [1, 2], [2, 3], [3, 4], [4, 5], [5, 0]],
         "sensors[0].nodes": [[0, 3]],
         "probe": [[1.0, 2.5, 3.0]],
@@ -297,6 +300,9 @@ def test_arrays_of_every_kind_are_lists(kind, ring):
     plain, other = made(list), made(kind)
     assert plain == other
     assert netkf.simulate(plain).fingerprint == netkf.simulate(other).fingerprint
+    numbers = {"network.activation.rate": 2.0, "network.channel.symmetric": False, "seed": 3}
+    arrays = {key: np.array(value) for key, value in numbers.items()}
+    assert plain.replace(arrays) == plain.replace(numbers)
     for flags in (np.array([[True]]), [[np.True_]], pd.DataFrame([[True]])):
         with pytest.raises(netkf.ScenarioError, match="R"):
             ring.replace({"sensors[0].R": flags})

@@ -213,6 +213,11 @@ def _are_equal(a: Any, b: Any) -> bool:
     return bool(a == b)
 
 
+def _of_array(value: Any) -> Any:
+    """Return the number in an array without dimensions, another value as it is."""
+    return value[()] if isinstance(value, np.ndarray) and not value.ndim else value
+
+
 def number(
     *,
     above: float = -math.inf,
@@ -233,6 +238,7 @@ def number(
     ]
 
     def convert(value: Any) -> float:
+        value = _of_array(value)
         if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
             raise TypeError
         result = float(value)
@@ -293,6 +299,9 @@ def integer(low: int | None = None, high: int | None = None) -> Rule:
     """Return the rule for an integer from ``low`` to ``high``; None means no limit."""
 
     def convert(value: Any) -> int:
+        value = _of_array(value)
+        if isinstance(value, np.floating) and value == np.rint(value) and abs(value) < 2**53:
+            value = int(value)  # an id in a row of numbers
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
             raise TypeError
         if (low is not None and value < low) or (high is not None and value > high):
@@ -320,9 +329,10 @@ MAX_MAGNITUDE = 1e30
 
 
 def _require_bool(value: Any) -> bool:
-    if not isinstance(value, bool):
+    value = _of_array(value)
+    if not isinstance(value, bool | np.bool_):
         raise TypeError
-    return value
+    return bool(value)
 
 
 boolean = Rule(

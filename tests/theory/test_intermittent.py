@@ -276,6 +276,11 @@ def test_arguments_of_a_wrong_kind_are_refused_with_one_line():
     calls += [(f, x) for f in takes_list.values() for x in ("text", None, 1j, [1, [2, 3]])]
     for value in (masked, eye.astype("m8[D]"), eye.astype(str), [["1", 0], [0, 1]]):
         calls.append((lambda x: theory.lyapunov_step(eye, x, eye), value))
+    for value in (np.empty((0, 0)), 1e200 * eye):
+        calls.append((lambda x: theory.lyapunov_step(x, x, x), value))
+        calls.append((lambda x: theory.riccati_flow(x, x, x, x, 1.0), value))
+        calls.append((lambda x: theory.critical_probability(x, x), value))
+        calls.append((lambda x: theory.steady_covariance(x, x, x, x), value))
     for call, value in calls:
         with pytest.raises(netkf.TheoryError) as caught:
             call(value)

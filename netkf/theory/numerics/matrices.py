@@ -25,6 +25,8 @@ from netkf.linalg.spectra import RATE, growth_rate, hidden_mode, outputs_of
 
 RESIDUAL = 1e-9  # of an equation, relative to its terms: larger ones mean a failed solver
 ROUNDING, NEWTON_STEPS = 1e-13, 4  # of a Riccati equation: what ends refinement, and when it must
+LARGEST = 1e100
+"""Size of the largest number in a matrix: products of three of them are numbers too."""
 MAX_STATES = 6
 """States up to which equations are solved by numpy alone: to import scipy.linalg takes longer."""
 
@@ -35,7 +37,10 @@ def as_numbers(name: str, value: ArrayLike) -> FloatArray:
         array = real_numbers(value)
     except (TypeError, ValueError, OverflowError):
         message = "must be a matrix of real numbers, rows of equal length"
-        raise TheoryError(f"{name} {message}, got a {type(value).__name__}") from None
+        kind = f"{type(value).__name__} {getattr(value, 'dtype', '')}".rstrip()
+        raise TheoryError(f"{name} {message}, got a {kind}") from None
+    if array.ndim == 2 and LARGEST < np.abs(array).max(initial=0.0) < np.inf:
+        raise TheoryError(f"{name} must have numbers of at most {LARGEST:g} in size")
     return array.reshape(1, 1) if array.ndim == 0 else array
 
 
@@ -77,13 +82,15 @@ def as_integer(name: str, value: object, min_value: int, max_value: float = MAX_
 
 
 def as_square(name: str, value: ArrayLike, n: int | None = None) -> FloatArray:
-    """Return ``value`` as a finite (n, n) array, any n if it is None; else raises TheoryError."""
+    """Return ``value`` as a finite (n, n) array, of any n > 0 if None; else raises TheoryError."""
     array = as_numbers(name, value)
     shape_text = "square" if n is None else f"{n} x {n}"
     if array.ndim != 2 or array.shape[0] != array.shape[1] or n not in (None, len(array)):
         raise TheoryError(f"{name} must be a {shape_text} matrix, its shape is {array.shape}")
     if not np.isfinite(array).all():
         raise TheoryError(f"{name} must be finite")
+    if n is None and not array.size:
+        raise TheoryError(f"{name} must not be empty, its shape is {array.shape}")
     return np.asarray(array)
 
 
