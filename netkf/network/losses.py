@@ -543,6 +543,7 @@ def fill_chances(
 ) -> None:
     """Write the delivery probabilities (K, 1) of ``messages`` (K, M) sent at ``times`` (K,)."""
     for k in range(len(times)):
+        out[k, 0] = math.nan  # a law that writes nothing says nothing
         call_function(address, messages[k], settings, times[k], 0.0, out[k])
 
 

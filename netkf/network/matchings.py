@@ -11,9 +11,11 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 
+from netkf.core.contracts import is_netkf_class
 from netkf.core.csv_files import read_columns, read_header
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
@@ -328,6 +330,17 @@ class RecordedSlots(SlotActivation):
         demand_links(self.path, first_line, topology)
 
 
+def _checked(activation: Matching, given: Any, topology: Topology) -> list[Link]:
+    """Return the pairs that a user's class drew; raises ScenarioError if they are no matching."""
+    pairs: list[Any] = [tuple(pair) for pair in given]
+    nodes = [node for pair in pairs for node in pair]
+    if len(set(nodes)) < len(nodes) or not set(pairs) <= set(topology.links):
+        name = f"{type(activation).__name__}.draw"
+        rule = f"{name} must return links (i, j) of the graph, i < j, with no node twice"
+        raise ScenarioError("network.activation", rule, pairs, "correct draw of the class")
+    return pairs
+
+
 def used_links(
     activation: object,
     topology: Topology,
@@ -339,7 +352,9 @@ def used_links(
     (None: all); matchings are drawn from ``random``.
     """
     if isinstance(activation, Matching):
-        return activation.draw(topology, random), None
+        pairs = activation.draw(topology, random)
+        is_own = not is_netkf_class(type(activation))
+        return _checked(activation, pairs, topology) if is_own else pairs, None
     if not isinstance(activation, RecordedSlots):
         return list(topology.links), None
     listed = activation.pairs(*step)

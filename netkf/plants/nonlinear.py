@@ -17,7 +17,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from netkf.core.clock import Clock
-from netkf.core.errors import ScenarioError
+from netkf.core.contracts import is_netkf_class
+from netkf.core.errors import ScenarioError, quote
 from netkf.core.fields import (
     SourceFile,
     definite_covariance,
@@ -74,13 +75,12 @@ class Linearised:
         ``y - h(xhat) + J xhat`` (p,) and the Jacobian J (p, n), which a linear filter uses as
         reading and H.
         """
-        J = np.asarray(self._sensor.jacobian(xhat, self._node), dtype=np.float64)[self._present]
+        J = jacobian_of(self._sensor, xhat, self._node)[self._present]
         return self.difference(y, self.value(xhat)) + J @ xhat, J
 
     def value(self, x: FloatArray) -> FloatArray:
         """Return the reading (p,) without noise at the state x (n,)."""
-        value: FloatArray = np.asarray(self._sensor.h(x, self._node), dtype=np.float64)
-        return np.asarray(value[self._present])
+        return np.asarray(reading_of(self._sensor, x, self._node)[self._present])
 
     def difference(self, y: FloatArray, expected: FloatArray) -> FloatArray:
         """Return the innovation (p,): a reading y (p,) minus the ``expected`` one (p,)."""
@@ -247,6 +247,35 @@ class NonlinearSensor(Sensor):
         return NonlinearSamples(self, node, generator("noise"))
 
 
+def reading_of(sensor: NonlinearSensor, x: FloatArray, node: int) -> FloatArray:
+    """Return h(x) (p,) on ``node`` (id); raises ValueError for other results of a user's class."""
+    return _result_of(sensor, "h", (len(sensor.R),), x, node)
+
+
+def jacobian_of(sensor: NonlinearSensor, x: FloatArray, node: int) -> FloatArray:
+    """Return the Jacobian (p, n) of h at x (n,), see ``reading_of``."""
+    return _result_of(sensor, "jacobian", (len(sensor.R), len(x)), x, node)
+
+
+def _result_of(
+    sensor: NonlinearSensor, method: str, shape: tuple[int, ...], x: FloatArray, node: int
+) -> FloatArray:
+    if is_netkf_class(type(sensor)):
+        return np.asarray(getattr(sensor, method)(x, node), dtype=np.float64)
+    given = getattr(sensor, method)(x.copy(), node)
+    result = np.asarray(given)
+    is_finite = result.dtype.kind in "fiu" and bool(np.isfinite(result).all())
+    # Of a state that has left the numbers nobody can know the reading.
+    if (
+        result.dtype.kind not in "fiu"
+        or result.shape != shape
+        or (not is_finite and np.isfinite(x).all())
+    ):
+        rule = f"{method} must return finite numbers of the shape {shape}, not {quote(given)}"
+        raise ValueError(f"{rule}, at x = {quote(x)}")
+    return result.astype(np.float64)
+
+
 class NonlinearReadings(SlotReadings):
     """The readings of a nonlinear sensor at one node (id), one a slot, with noise from ``random``.
 
@@ -264,8 +293,7 @@ class NonlinearReadings(SlotReadings):
     def reading(self, slot: int, x: FloatArray) -> FloatArray:
         """Return the reading ``h(x) + v`` (p,) of slot number ``slot``, see Readings."""
         noise = self.noise(slot)
-        y: FloatArray = np.asarray(self._sensor.h(x, self._node), dtype=np.float64) + noise
-        return y
+        return reading_of(self._sensor, x, self._node) + noise
 
 
 class NonlinearSamples(DrawnSamples):

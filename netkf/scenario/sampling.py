@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from netkf.core.clock import Clock, stated_rate
-from netkf.core.errors import ScenarioError, errors_under
+from netkf.core.contracts import is_netkf_class
+from netkf.core.errors import ScenarioError, errors_under, quote
 from netkf.core.places import Place
 from netkf.linalg.arrays import FloatArray
 from netkf.network.node_clocks import node_time
@@ -47,10 +48,23 @@ def times_of_sensor(
     until = own.until(scenario.horizon, ahead)
     with errors_under(scenario.sensor_key(placed_sensor.entry)):
         times = sensor.sample_times(node, placed_sensor.ordinal, generator, until)
+        if not is_netkf_class(type(sensor)):
+            times = _checked_times(sensor, times)
     times = scenario.time_grid.before(scenario.horizon, own.instants(times, ahead))
     # Rows of one instant are one sample.
     is_recorded = isinstance(getattr(sensor, "sampling", None), RecordedSampling)
     return np.unique(times) if is_recorded else times
+
+
+def _checked_times(sensor: Sensor, given: Any) -> FloatArray:
+    """Return the times that a user's sensor gives; raises ScenarioError unless they increase."""
+    times = np.asarray(given)
+    is_vector = times.ndim == 1 and (times.dtype.kind in "fiu" or not len(times))
+    if not (is_vector and (np.diff(times, prepend=0.0) >= 0.0).all() and np.isfinite(times).all()):
+        name = f"{type(sensor).__name__}.sample_times"
+        rule = f"{name} must return times of at least 0 that increase, not {quote(given)}"
+        raise ScenarioError("sampling", rule)
+    return times.astype(np.float64)
 
 
 def sample_path(

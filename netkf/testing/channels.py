@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable
 from functools import partial
@@ -26,7 +27,13 @@ from netkf.network.channels import BroadcastSampler, Channel, ChannelSampler, co
 from netkf.network.delays import Delay
 from netkf.network.delays import delay_depends_on_message as overrides_message_delay
 from netkf.network.graphs import Complete, Link, Topology
-from netkf.network.losses import Loss, Transmission, delivery_probabilities, has_conditions
+from netkf.network.losses import (
+    KernelLoss,
+    Loss,
+    Transmission,
+    delivery_probabilities,
+    has_conditions,
+)
 from netkf.rng.streams import Streams
 from netkf.testing.generators import Calls, RecordingGenerator, describe_calls
 from netkf.testing.noise import demand_agreement, family_level
@@ -118,6 +125,8 @@ def _check_channel(part: Any, topology: Topology | None, seed: int) -> None:
     ]
     for one in sent:
         _check_delivery_probabilities(watched, one)
+    if isinstance(part, KernelLoss):
+        _check_law_in_python(watched, sent)
     _check_pure(watched, sent)
     _check_identical_links(watched, sent)
     _check_channel_state(watched)
@@ -161,6 +170,19 @@ def _messages(one: Transmission) -> list[Transmission]:
         for number, time in zip(MESSAGES, TIMES, strict=True)
         for bad in (False, True)
     ]
+
+
+def _check_law_in_python(watched: WatchedPart, sent: list[Transmission]) -> None:
+    """Compiled code would not notice a setting that is not there, or a law that writes nothing."""
+    part, law = watched.part, inspect.getattr_static(type(watched.part), "law")
+    loops, rule = getattr(law, "loops", law), "must give as plain Python what it gives compiled"
+    for one in sent:
+        out = np.full(1, np.nan)
+        with guard_user_code(f"{watched.name}.law"):
+            loops(part.describe(one)[0], part.settings, one.time, out)
+        compiled = part.delivery_probability(one)
+        is_same = abs(out[0] - compiled) <= PROBABILITY_TOLERANCE
+        watched.demand("law", is_same, rule, f"{out[0]:.4g} and {compiled:.4g}")
 
 
 def _check_pure(watched: WatchedPart, sent: list[Transmission]) -> None:

@@ -68,6 +68,27 @@ class Wrong(KernelLoss):
     first: float = setting(probability)
 
 
+@kernel
+def silent_law(message: Any, settings: Any, t: float, out: Any) -> None:
+    """Writes nothing for most messages."""
+    if message[2] < 2.0:
+        out[0] = settings[0]
+
+
+@kernel
+def astray_law(message: Any, settings: Any, t: float, out: Any) -> None:
+    """Reads what is no setting."""
+    out[0] = 0.5 + 0.0 * min(settings[3], 0.0)
+
+
+class Silent(Wrong):
+    law = silent_law
+
+
+class Astray(Wrong):
+    law = astray_law
+
+
 @dataclass(frozen=True, eq=False)
 class NoKernel(KernelLoss):
     """Its law is plain Python."""
@@ -119,6 +140,18 @@ def test_probabilities_that_are_none_are_refused_in_one_line() -> None:
             ScenarioError, match=r"Wrong: .* message 7 on link .* got nan; correct the law"
         ):
             netkf.simulate(scenario, engine=engine)
+
+
+def test_what_compiled_code_does_not_notice_is_found() -> None:
+    for name, engine in (("gossip_ring", "compiled"), ("poisson_ring", "simpy")):
+        loss = {"kind": f"{__name__}:Silent", "first": 0.5}
+        scenario = netkf.load(SCENARIOS / f"{name}.toml").replace({"network.channel.loss": loss})
+        with pytest.raises(
+            ScenarioError, match=r"Silent: .* message 2 on link .* got nan; correct"
+        ):
+            netkf.simulate(scenario, engine=engine)
+    with pytest.raises(AssertionError, match=r"Astray\.law: failed with IndexError"):
+        check_channel(Astray(first=0.5))
 
 
 def test_a_law_is_marked_as_a_kernel() -> None:

@@ -111,6 +111,14 @@ MISTAKES = {
     "jacobian fails": ("SENSOR", "def h(self, x, node): return x\n"
                        "def jacobian(self, x, node): return x[5]",
                        r"F failed in jacobian: IndexError.*; FILE, line 7"),
+    "h is nan": ("SENSOR", "def h(self, x, node): return np.array([np.nan])\n"
+                 "def jacobian(self, x, node): return np.eye(1)",
+                 r"F failed after h \(FILE, line 6\) returned \[nan\]: .*h must return finite numbers of the shape \(1,\)"),
+    "a jacobian of another width": ("SENSOR", "def h(self, x, node): return x\n"
+                                    "def jacobian(self, x, node): return np.ones((1, 2))",
+                                    r"jacobian must return finite numbers of the shape \(1, 1\), not \[\[1\.0, 1\.0\]\]"),
+    "a complex h": ("SENSOR", "def h(self, x, node): return x + 1j\n"
+                    "def jacobian(self, x, node): return np.eye(1)", r"h must return finite numbers .* at x = \["),
     "a sensor defines half": ("SENSOR", "def h(self, x, node): return x", "must define jacobian"),
     "a sensor defines nothing": ("SENSOR", "pass", "must define h, jacobian"),
     "build returns nothing": ("GRAPH", "def build(self, seed): pass",
@@ -275,6 +283,38 @@ def test_a_covariance_that_is_not_symmetric_ends_a_run(ring):
         netkf.EngineError, match=r"Skew failed after estimate .* P must be symmetric"
     ):
         netkf.simulate(ring.replace({"filter": Skew()}))
+
+
+@dataclass(frozen=True, eq=False)
+class Early(parts.LinearSensor):
+    def sample_times(self, node, ordinal, generator, horizon):
+        return np.array([-1.0, 0.5])
+
+
+@dataclass(frozen=True, eq=False)
+class Bigamy(parts.Matching):
+    protocol: str = "one-edge"
+
+    def draw(self, topology, random):
+        return [(0, 1), (1, 2)]
+
+
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_what_would_lead_kernels_astray_is_refused(engine, ring, build):
+    """Times before 0 ended the process, and a node in two pairs swapped its state twice."""
+    sensor = Early(nodes=(0,), H=[[1.0, 0.0]], R=[[1.0]], sampling=parts.Poisson(rate=1.0))
+    with pytest.raises(netkf.ScenarioError, match=r"Early\.sample_times must return times of at l"):
+        netkf.simulate(ring.replace({"sensors": (sensor,)}), engine=engine)
+    plant = {"kind": "linear", "F": [[0.9]], "Q": [[1.0]], "period": 1.0}
+    network = {
+        "graph": {"kind": "path", "nodes": 3},
+        "activation": {"kind": "matching", "protocol": "one-edge"},
+    }
+    scenario = build(plant=plant, network=network, filter={"kind": "gossip"}, probe=1.0)
+    with pytest.raises(
+        netkf.ScenarioError, match=r"Bigamy\.draw must return links .* no node twice"
+    ):
+        netkf.simulate(scenario.replace({"network.activation": Bigamy()}), engine=engine)
 
 
 def test_float32_delays_are_numbers_in_both_engines(build):

@@ -18,7 +18,12 @@ from netkf.algorithms.kernels.nonlinear_rows import (
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.vector_functions import VectorFunction
-from netkf.plants.nonlinear import NonlinearSensor, PositionedSensor
+from netkf.plants.nonlinear import (
+    NonlinearSensor,
+    PositionedSensor,
+    jacobian_of,
+    reading_of,
+)
 from netkf.plants.relative import RelativePositionSensor
 
 
@@ -129,10 +134,10 @@ def _functions_of(
         return state
 
     def h(x: FloatArray, _: FloatArray, node: float) -> Any:
-        return sensor.h(whole(x), int(node))
+        return reading_of(sensor, whole(x), int(node))
 
     def jacobian(x: FloatArray, _: FloatArray, node: float) -> Any:
-        J = np.asarray(sensor.jacobian(whole(x), int(node)), dtype=np.float64)
+        J = jacobian_of(sensor, whole(x), int(node))
         own = np.zeros((len(J), n))
         own[:, is_own] = J[:, entries[is_own]]
         return own

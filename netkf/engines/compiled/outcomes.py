@@ -179,7 +179,7 @@ def _chance_by_law(chances: Chances, run: int, w: int, t: float) -> float:
     k, message = run * len(chances.first) + w, chances.message
     for i in range(len(message)):
         message[i] = chances.first[w, i]
-    message[NUMBER] = chances.sent[k]
+    message[NUMBER], chances.out[0] = chances.sent[k], math.nan
     call_function(chances.address, message, chances.settings, t, 0.0, chances.out)
     chance = chances.out[0]
     if not 0.0 <= chance <= 1.0 and chances.wrong[0] < 0.0:
