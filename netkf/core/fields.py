@@ -149,9 +149,10 @@ class Component:
         return hash((type(self), len(dataclasses.fields(self))))
 
 
-def check_values(part: Component) -> None:
+def check_values(part: object) -> None:
     """Raise ScenarioError for a value that a user's class states and that breaks its rule."""
-    for name, rule in part._values.items():
+    rules: Mapping[str, Rule] = getattr(part, "_values", {})  # a user's dynamics are no Component
+    for name, rule in rules.items():
         rule(f"{type(part).__name__}.{name}", getattr(part, name))
 
 

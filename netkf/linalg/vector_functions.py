@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, real_numbers
 from netkf.linalg.compiling import require_numba
 from netkf.linalg.functions import plain_address
 from netkf.linalg.plain import is_plain
@@ -89,7 +89,7 @@ class VectorFunction:
     def _write(self, x: FloatArray, u: FloatArray, t: float, period: float, out: Any) -> None:
         try:
             others = [float(period)] if self._takes_period else []
-            value = np.asarray(self._function(x, u, float(t), *others), dtype=np.float64)
+            value = real_numbers(self._function(x, u, float(t), *others))
             if value.shape != out.shape:
                 raise ValueError(f"returned shape {value.shape} instead of {out.shape}")
             out[...] = value

@@ -390,7 +390,7 @@ def test_filters_that_cannot_be_told_are_refused():
         scenario({"kind": "local"}, LINEAR, None).replace({"filter": Louder()})
     assert refusal.value.key == "filter.kind"
     deaf = scenario({"kind": "kcf", "epsilon": 0.1}, LINEAR, {"kind": "broadcast"})
-    with pytest.raises(TypeError, match=r"Deaf.predict must call model.predict"):
+    with pytest.raises(netkf.EngineError, match=r"Deaf.predict must call model.predict"):
         netkf.simulate(deaf.replace({"filter": Deaf()}), engine="simpy")
 
 

@@ -406,7 +406,7 @@ def test_both_engines_agree(folder, case, method):
 def test_an_error_of_a_sensor_ends_the_run(folder):
     network = LATE | {"graph": {"kind": "path", "nodes": 3}}
     scenario = from_table(table(plant=SWING, network=network, sensors=[DISTANCE]), folder)
-    with pytest.raises(ValueError, match="no such node"):
+    with pytest.raises(netkf.EngineError, match="Cubes failed in h: ValueError: no such node"):
         netkf.simulate(
             dataclasses.replace(scenario, sensors=(dataclasses.replace(CUBES, nodes=(2,)),)),
             engine="compiled",
