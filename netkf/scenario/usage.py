@@ -35,7 +35,9 @@ OUTCOMES = {
     "lose": "were lost",
     "repeat": "followed the record from its start again",
 }
-"""What happened to messages that a table of losses does not list, by its ``after``."""
+"""What happened to messages that a table of losses does not list, by its ``after``; with "refuse"
+no run ends that needed one: delays of lost messages are not needed.
+"""
 NO_DELAY = "took no time unless lost"
 """What happened to messages that a table of delays with ``after`` "deliver" does not list."""
 
@@ -78,8 +80,8 @@ def usage_notes(usage: Mapping[str, Use]) -> tuple[str, ...]:
         if use["unused"]:
             was = "row was" if use["rows"] == 1 else "rows were"
             notes.append(f"{key}: {use['unused']} of {use['rows']} {was} not used ({use['path']})")
-        if use.get("beyond"):
-            count, outcome = use["beyond"], OUTCOMES.get(use["after"], "were refused")
+        if use.get("beyond") and use["after"] in OUTCOMES:
+            count, outcome = use["beyond"], OUTCOMES[use["after"]]
             if key.endswith("delay") and use["after"] == "deliver":
                 outcome = NO_DELAY
             subject = "message is" if count == 1 else "messages are"

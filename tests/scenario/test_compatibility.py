@@ -291,4 +291,7 @@ def test_what_a_run_used_of_its_records(build, tmp_path):
         "network.channel.delay: 3 messages are not listed and took no time unless lost (late.csv)",
         "sensors[0].sampling: 2 of 3 rows were not used (samples.csv)",
     )
+    # A run that refuses what is not listed has ended: what has no delay was lost.
+    delay = {**usage["network.channel.delay"], "after": "refuse"}
+    assert usage_notes({"network.channel.delay": delay}) == ()
     assert record_usage(build(), {(0, 1): 3}) == {}
