@@ -196,8 +196,9 @@ def fit_log(
 
 
 def read_outcomes(scenario: Scenario) -> tuple[pd.DataFrame, list[str]]:
-    """Return recorded outcomes by message, and notes. Packets that nobody reported count as lost:
-    those left were all heard by somebody, which would bias deliveries. Raises ScenarioError.
+    """Return recorded outcomes by message, with how many their link ``sent``, and notes. Packets
+    that nobody reported count as lost: those left were all heard by somebody, which would bias
+    deliveries. Raises ScenarioError.
     """
     loss = scenario.network.channel.loss
     if not isinstance(loss, RecordedLoss):
@@ -205,23 +206,31 @@ def read_outcomes(scenario: Scenario) -> tuple[pd.DataFrame, list[str]]:
         raise ScenarioError("network.channel.loss.kind", rule, type(loss).__name__, remedy)
     table = _read_table(loss.path.full)
     table["unreported"] = False
-    path = loss.path.full.with_name(UNKNOWN)
+    path, last = loss.path.full.with_name(UNKNOWN), table[KEY]
     if path.is_file():
         silent = _read_table(path)
+        last = pd.concat([last, silent[KEY]])
         silent = silent[[why == UNREPORTED for why in silent.get("why", [""] * len(silent))]]
         table = pd.concat([table, silent.assign(delivered=0, unreported=True)])
         table = table.drop_duplicates(KEY).reset_index(drop=True)
+    table = table.join(last.groupby(KEY[:2])["message"].max().rename("sent") + 1, on=KEY[:2])
     if "t" not in table:
         table["t"] = table["message"].astype(float)
     if "transmission" not in table:
         table["transmission"] = table["sender"] + " " + table["message"].astype(str)
-    sent = int((table.groupby(["sender", "receiver"])["message"].max() + 1).sum())
+    sent = int(table.groupby(KEY[:2])["sent"].first().sum())
     notes = [f"{len(table):,} of {sent:,} outcomes are known"]
     count = int(table["unreported"].sum())
     if count:
         notes.append(
             f"{count:,} of them are of packets that nobody reported and count as lost; at_least "
             "and at_most in fit_links.csv say what else they may have been"
+        )
+    untold = int((table["channel"] == "").sum()) if "channel" in table else 0
+    if 0 < untold < len(table):
+        notes.append(
+            f"{untold:,} of them are of packets whose channel nobody tells: deliveries of channels "
+            "and shared fate are of the others"
         )
     if len(table) < sent and loss.after == "deliver":
         notes.append("messages that are not listed count as unknown, not as delivered")
@@ -254,8 +263,7 @@ def _complete_replay(
     random, parts = np.random.default_rng(scenario.seed), [table[[*KEY, "delivered"]]]
     for sender, receiver, delivery in links[[*KEY[:2], "delivery_probability"]].to_numpy().tolist():
         own = (table["sender"] == sender) & (table["receiver"] == receiver)
-        messages = table["message"][own].to_numpy()
-        unknown = np.setdiff1d(np.arange(messages.max() + 1), messages)
+        unknown = np.setdiff1d(np.arange(table["sent"][own].max()), table["message"][own])
         drawn = (random.random(len(unknown)) < delivery).astype(int)
         part = {"sender": sender, "receiver": receiver, "message": unknown, "delivered": drawn}
         parts.append(pd.DataFrame(part))
@@ -395,7 +403,7 @@ def _link_table(
     count, heard = outcomes.counts.T.astype(float)
     each = level / len(count)
     low, high = stats.binomial_interval(heard / shrink, count / shrink, each)
-    sent = table.groupby(["sender", "receiver"])["message"].max() + 1
+    sent = table.groupby(KEY[:2])["sent"].first()
     rows = pd.DataFrame(outcomes.links, columns=["sender", "receiver"])
     rows["packets"], rows["heard"] = count.astype(int), heard.astype(int)
     rows["unknown"] = [int(sent[link]) for link in outcomes.links] - rows["packets"]
@@ -475,7 +483,7 @@ def _varying_laws(
         laws.append(_varying_law("scheduled", counts, rows, shrink))
     if "channel" in tests and tests["channel"].p < MAYBE:
         counts = outcomes.by_channel.sum(axis=1).astype(float)
-        numbers = {name: k for k, name in enumerate(sorted(set(outcomes.channels)))}
+        numbers = {name: k for k, name in enumerate(outcomes.channel_names)}
         laws.append(_varying_law("hopping", counts, _hops(outcomes, numbers, end), shrink))
     return laws
 
@@ -484,7 +492,7 @@ def _hops(outcomes: Outcomes, numbers: Mapping[str, int], end: float) -> list[In
     """Return an interval around each transmission, with the number of its channel."""
     sent: dict[int, list[tuple[float, int]]] = {}
     for group, channel in zip(outcomes.groups, outcomes.channels, strict=True):
-        for link in group.links.tolist():
+        for link in group.links.tolist() if channel in numbers else ():
             sent.setdefault(link, []).extend((t, numbers[channel]) for t in group.t.tolist())
     rows = []
     for link, own in sent.items():

@@ -122,16 +122,20 @@ class Outcomes:
             moves[group.links, 3] += (both & (last == 0) & (now == 1)).sum(axis=0)
         return moves
 
+    @property
+    def channel_names(self) -> list[str]:
+        """The C channels, "" for one that is not known only if no other is."""
+        return sorted({*self.channels} - {""}) or [""]
+
     @cached_property
     def by_channel(self) -> np.ndarray:
         """``counts`` for each channel, (C, L, 2)."""
-        names = sorted(set(self.channels))
         return np.stack(
             [
                 self._sum(
                     tuple(g for g, c in zip(self.groups, self.channels, strict=True) if c == n)
                 )
-                for n in names
+                for n in self.channel_names
             ]
         )
 
@@ -233,6 +237,8 @@ def _z_test(assumption: str, what: str, units: FloatArray, scale: float) -> Test
     if scale <= 0.0 or variance <= 0.0 or len(units) < MIN_PACKETS:
         return Test(assumption, what, np.nan, np.nan, np.nan)
     deviation = math.sqrt(variance)
+    if deviation > 0.5 * scale:  # no departure is above 1
+        return Test(assumption, what, np.nan, np.nan, np.nan)
     p = 2.0 * float(norm.sf(abs(units.sum()) / deviation))
     return Test(assumption, what, float(units.sum() / scale), p, deviation / scale)
 

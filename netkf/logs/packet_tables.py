@@ -60,6 +60,7 @@ LOST = ("lost", "loss", "drop", "dropped", "miss", "missed")
 YES = ("1", "1.0", "true", "yes", "y", "ok", *HEARD)
 NO = ("0", "0.0", "false", "no", "n", "fail", "failed", *LOST)
 UNKNOWN = ("", "nan", "na", "none", "unknown", "?", "-1")
+MAX_CYCLE = 64  # channels over which packets of a sender hop in turn
 NO_STAMP = ("", "nan", "na", "nat", "none", "null", "-1", *LOST)  # of t_heard
 EXTRAS = ("positions", "readings")
 
@@ -427,6 +428,7 @@ def _skipped(sends: pd.DataFrame, notes: list[str]) -> pd.DataFrame:
         own = rows.sort_values("counter")
         counters, times = own["counter"].to_numpy(), own["t"].to_numpy()
         channels = own["channel"].tolist()
+        cycle = _find_cycle(counters, channels)
         for k in np.flatnonzero(np.diff(counters) > 1).tolist():
             count = int(counters[k + 1] - counters[k])
             if count > MAX_SKIP:
@@ -434,9 +436,11 @@ def _skipped(sends: pd.DataFrame, notes: list[str]) -> pd.DataFrame:
                 continue
             for j in range(1, count):
                 t = times[k] + (times[k + 1] - times[k]) * j / count
+                counter = int(counters[k]) + j
                 channel = channels[k] if channels[k] == channels[k + 1] else ""
+                channel = cycle[counter % len(cycle)] if cycle else channel
                 row = {"sender": sender, "t": round(t, 9), "channel": channel, "to": to}
-                row |= {"counter": counters[k] + j, "sent": False, "logged": False}
+                row |= {"counter": counter, "sent": False, "logged": False}
                 found.append(row)
     if found:
         notes.append(
@@ -451,6 +455,17 @@ def _skipped(sends: pd.DataFrame, notes: list[str]) -> pd.DataFrame:
     columns = ["sender", "t", "channel", "to", "counter", "sent", "logged"]
     keys = [_key(row["sender"], row["to"], row["counter"]) for row in found]
     return pd.DataFrame(found, columns=columns, index=keys)
+
+
+def _find_cycle(counters: np.ndarray, channels: list[str]) -> list[str]:
+    """Return the channels over which packets hop in turn, by their counter modulo the length of the
+    list; empty if they hop otherwise.
+    """
+    for length in range(1, min(MAX_CYCLE, len(counters) // 3) + 1):
+        found = dict(zip((counters % length).tolist(), channels, strict=True))
+        if len(found) == length and channels == [found[c] for c in (counters % length).tolist()]:
+            return [found[k] for k in range(length)]
+    return []
 
 
 def _merge_rows(rows: pd.DataFrame, notes: list[str], log: str) -> pd.DataFrame:

@@ -28,7 +28,7 @@ heard by its usual deliveries.
 """
 USUAL = 0.1
 """The smallest delivery of a sender whose silence says something."""
-MODULI = (16, 100, 128, 256, 1000, 1024, 4096, 10_000, 65_536, 2**32)
+MODULI = sorted([*(2**k for k in (*range(4, 17), 24, 32)), 100, 1000, 10_000])
 """Lengths after which counters of packets begin again."""
 MAX_SKIP = 1000
 """Numbers skipped at once beyond which a counter began again: nothing is known of what lies
@@ -101,7 +101,7 @@ def read_texts(path: Path) -> pd.DataFrame:
 
 
 def _with_points(column: pd.Series) -> pd.Series:
-    is_decimal = column.str.fullmatch(r"[+-]?\d+,\d+").fillna(False).all()
+    is_decimal = column.str.fullmatch(r"([+-]?\d+(,\d+)?)?|nan").fillna(False).all()
     return column.str.replace(",", ".") if is_decimal else column
 
 

@@ -305,6 +305,33 @@ def test_what_nobody_reported_counts_as_lost_and_holes_do_not(tmp_path):
     assert "per-link" in repr(fit)
 
 
+def test_nodes_that_die_or_come_late_and_channels_in_turn(tmp_path):
+    """What is not known at the end of a log is not known, and not lost; packets that nobody heard
+    were on the channel whose turn it was, and do not make hearers look dependent.
+    """
+    random, rows, quality = np.random.default_rng(4), ["t,src,dst,seq,channel"], (0.9, 0.7, 0.4)
+    for k in range(500):
+        present = [i for i in range(5) if not (i == 1 and k >= 300) and not (i == 4 and k < 150)]
+        for i in present:
+            heard = [j for j in present if j != i and random.random() < quality[k % 3]]
+            rows += [f"{k + 0.1 * i + 1:.1f},{i},{j},{k % 64},CH{k % 3}" for j in heard]
+    (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
+    netkf.import_log(tmp_path / "log.csv", "csv", tmp_path / "out")
+    fit = netkf.fit_log(tmp_path / "out", runs=10, workers=1)
+    accounts = pd.read_csv(tmp_path / "out" / "accounts.csv")
+    assert (fit.links["packets"] + fit.links["unknown"]).tolist() == accounts["sent"].tolist()
+    assert fit.links["unknown"].sum() > 900
+    tests = fit.tests.set_index("key")
+    rejected = tests.index[tests["verdict"] == "rejected"].tolist()
+    assert rejected == ["channel"]
+    # The next packet of a sender on one channel is three numbers later: nothing tells of time.
+    assert tests.loc["time", "verdict"] == "not tested"
+    hopping = pd.read_csv(tmp_path / "out" / "fit_hopping.csv")["delivery"]
+    np.testing.assert_allclose(np.sort(hopping.unique()), sorted(quality), atol=0.04)
+    heard = fit.envelope[fit.envelope["quantity"].isin(["messages heard", "mean age (s)"])]
+    assert heard["inside"].all()
+
+
 def test_links_with_bursts_of_their_own(tmp_path):
     """The table of chains holds what follows what in the record, and its runs are like the log."""
     random, rows, bad = np.random.default_rng(5), ["t,src,dst,seq,heard"], {}

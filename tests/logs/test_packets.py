@@ -447,6 +447,14 @@ def test_places_and_readings_beside_a_log_are_taken_whole_or_counted(tmp_path):
         netkf.import_log(tmp_path, "csv", tmp_path / "two")
 
 
+def test_columns_of_decimal_commas_may_have_whole_numbers(tmp_path):
+    write(tmp_path / "log.csv", ["t;src;dst;seq", "1;1;2;0", "2,5;1;2;1", "3;2;1;0"])
+    write(tmp_path / "positions.csv", ["node;x;y", "1;0;3", "2;10,5;4"])
+    netkf.import_log(tmp_path / "log.csv", "csv", tmp_path / "out")
+    assert table(tmp_path / "out", "positions.csv")["x"].tolist() == [0.0, 10.5]
+    assert table(tmp_path / "out", "transmissions.csv")["t"].tolist() == [1.0, 2.5, 3.0]
+
+
 def test_a_log_may_take_the_plant_of_a_scenario(tmp_path):
     log, _ = made(tmp_path, 50)
     changes = {"network.graph": {"kind": "complete", "nodes": 3}, "sensors": SENSORS}
