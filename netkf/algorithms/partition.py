@@ -11,6 +11,9 @@ is a bound again, with b = a among them. The weights here are those with the lea
 proportion to the root of the trace of ``A_ab P_b A_ab'``: without coupling it is the prediction of
 a Kalman filter.
 
+A node keeps the whole state, its own blocks first. Its *groups* are its own blocks, and then all
+blocks of each other owner; nothing is known of how errors of two groups correlate.
+
 Farina, Ferrari-Trecate and Scattolini, "Moving-horizon partition-based state estimation of
 large-scale systems", Automatica 46(5), 2010; Khan and Moura, "Distributing the Kalman filter for
 large-scale systems", IEEE Trans. Signal Processing 56(10), 2008.
@@ -18,76 +21,581 @@ large-scale systems", IEEE Trans. Signal Processing 56(10), 2008.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import scipy
 
-from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, PairReading, Reading
+from netkf.algorithms.filter import Filter, NodeInfo
+from netkf.algorithms.kernels.block_fusion import (
+    CI,
+    NAIVE,
+    NO_GAIN,
+    fuse,
+    fusion_of,
+    semidefinite_root,
+)
+from netkf.algorithms.kernels.run import predict_estimate, shift_vector, transition
+from netkf.algorithms.records import Kernels, Record, estimate_shapes
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.traits import Analysis, Needs
 from netkf.core.places import Key, Place
-from netkf.linalg.arrays import FloatArray, symmetric
-
-MARGIN = 1e-6
-"""Weights of covariance intersection are at least this."""
-ROUNDING = 2.0**-52
-"""Spacing of floating-point numbers at 1: relative size of eigenvalues that are 0."""
+from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.structs import Struct
 
 
-class Start(NamedTuple):
-    """What all nodes know before the first reading, predicted to the present: mean (n,) and
-    covariance ``cov`` (n, n) of the whole state.
+class Groups(Struct):
+    """The groups of K states of N entries.
+
+    number, count : (K, N), that of each entry, and (K,), how many there are
+    member, first : (K, N), the entries by group; those of group g begin with ``first[k, g]``
     """
 
-    mean: FloatArray
-    cov: FloatArray
+    number: IntArray
+    count: IntArray
+    member: IntArray
+    first: IntArray
 
 
-class Gap(NamedTuple):
-    """The time since a node last used something: the transition Phi (n, n), and Q (n, n)."""
+def groups_of(number: IntArray) -> Groups:
+    """Return the groups with these numbers (K, N)."""
+    count = 1 + number.max(axis=1, initial=0)
+    ends = np.arange(number.shape[1] + 1)
+    first = [np.searchsorted(np.sort(row), ends) for row in number]
+    return Groups(
+        number=number,
+        count=count,
+        member=np.argsort(number, axis=1, kind="stable"),
+        first=np.array(first, dtype=np.int64).reshape(len(number), -1),
+    )
 
-    Phi: FloatArray
-    Q: FloatArray
+
+@kernel
+def set_gap(record: Any, h: int, run: Any) -> None:
+    """Write how node ``h`` moves over ``run.gap`` seconds into ``T`` and the noise ``W`` (N, N)."""
+    n, root = len(record.T), record.moved_root
+    transition(run.model, run, record.x, h, run.noise)
+    for i in range(n):
+        for j in range(n):
+            record.T[i, j] = run.noise[i, j, 0]
+    record.moved_x[:], root[:] = 0.0, 0.0
+    predict_estimate(run.model, run, record.moved_x, root, 0, h)
+    for i in range(n):
+        for j in range(i + 1):
+            total = 0.0
+            for c in range(j + 1):
+                total += root[0, i, c, 0] * root[0, j, c, 0]
+            record.W[i, j] = record.W[j, i] = total
 
 
-class PartitionState(NamedTuple):
-    """What a node knows of the whole state, of n components.
+@kernel
+def are_alike(A: FloatArray, k: int) -> bool:
+    """Return True if the matrix ``A[k]`` (n, n, L) is the same in all lanes."""
+    for i in range(A.shape[1]):
+        for j in range(A.shape[2]):
+            for q in range(1, A.shape[3]):
+                if A[k, i, j, q] != A[k, i, j, 0]:
+                    return False
+    return True
 
-    x : (n,) its estimate now
-    bounds : (n, n) of its ``groups``, when it last used something: covariances of their errors are
-             no larger. 0 between groups, where nothing is known
-    gap : the time since then
-    start : see Start
-    groups : entries of what the node estimates, and then of all other blocks of each owner
-    model : that of the whole state
-    places : all blocks; ``blocks``: the names and owners of those that it estimates
-    waits : messages may take time
+
+@kernel
+def move_vector(T: FloatArray, x: FloatArray, h: int, scratch: FloatArray) -> None:
+    """Multiply ``x[h]`` (N, L) by ``T``."""
+    n = len(T)
+    for q in range(x.shape[2]):
+        for i in range(n):
+            scratch[i] = x[h, i, q]
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                total += T[i, j] * scratch[j]
+            x[h, i, q] = total
+
+
+@kernel
+def move_columns(T: FloatArray, A: FloatArray, h: int, q: int, scratch: FloatArray) -> None:
+    """Multiply the matrix ``A[h]`` by ``T`` from the left in lane ``q``."""
+    n = len(T)
+    for j in range(n):
+        for i in range(n):
+            scratch[i] = A[h, i, j, q]
+        for i in range(n):
+            total = 0.0
+            for c in range(n):
+                total += T[i, c] * scratch[c]
+            A[h, i, j, q] = total
+
+
+@kernel
+def copy_lane(A: FloatArray, h: int, q: int, end: int) -> None:
+    """Copy the matrix ``A[h]`` of lane ``q`` to those up to ``end``."""
+    for p in range(q + 1, end):
+        for i in range(A.shape[1]):
+            for j in range(A.shape[2]):
+                A[h, i, j, p] = A[h, i, j, q]
+
+
+@kernel
+def move_covariance(record: Any, P: FloatArray, h: int, q: int) -> None:
+    """Replace ``P[h]`` by ``T P T' + W`` in lane ``q``."""
+    T, row, n = record.T, record.row, len(record.T)
+    move_columns(T, P, h, q, row)
+    for i in range(n):
+        for j in range(n):
+            row[j] = P[h, i, j, q]
+        for j in range(i + 1):
+            total = record.W[i, j]
+            for c in range(n):
+                total += row[c] * T[j, c]
+            P[h, i, j, q] = total
+    for i in range(n):
+        for j in range(i):
+            P[h, j, i, q] = P[h, i, j, q]
+
+
+@kernel
+def size_of_term(record: Any, groups: Groups, k: int, g: int, other: int) -> float:
+    """Return the root of the trace of the covariance that group ``other`` brings into ``g``."""
+    Phi, bounds, total = record.Phi_now, record.bounds_now, 0.0
+    for c in range(groups.first[k, g], groups.first[k, g + 1]):
+        i = groups.member[k, c]
+        for d in range(groups.first[k, other], groups.first[k, other + 1]):
+            a = groups.member[k, d]
+            for e in range(groups.first[k, other], groups.first[k, other + 1]):
+                b = groups.member[k, e]
+                total += Phi[i, a] * bounds[a, b] * Phi[i, b]
+    return math.sqrt(max(0.0, total))
+
+
+@kernel
+def add_term(
+    record: Any, groups: Groups, k: int, g: int, other: int, factor: float, P: FloatArray
+) -> None:
+    """Add the covariance that group ``other`` brings into ``g``, times ``factor``, to ``P``."""
+    Phi, bounds, row = record.Phi_now, record.bounds_now, record.row
+    start, end = groups.first[k, other], groups.first[k, other + 1]
+    for c in range(groups.first[k, g], groups.first[k, g + 1]):
+        i = groups.member[k, c]
+        for e in range(start, end):
+            b, row[e] = groups.member[k, e], 0.0
+            for d in range(start, end):
+                a = groups.member[k, d]
+                row[e] += factor * Phi[i, a] * bounds[a, b]
+        for d in range(groups.first[k, g], c + 1):
+            j = groups.member[k, d]
+            for e in range(start, end):
+                P[i, j] += row[e] * Phi[j, groups.member[k, e]]
+            P[j, i] = P[i, j]
+
+
+@kernel
+def bound_after(record: Any, groups: Groups, k: int, g: int, P: FloatArray) -> None:
+    """Write into the entries of ``P`` of group ``g`` of number ``k`` of ``groups`` the bound of its
+    covariance that has the least trace, after a move by ``Phi_now`` with the noise ``Q_now`` from
+    ``bounds_now``.
     """
+    sizes, total, own = record.sizes, 0.0, groups.member[k]
+    for other in range(groups.count[k]):
+        sizes[other] = size_of_term(record, groups, k, g, other)
+        total += sizes[other]
+    for c in range(groups.first[k, g], groups.first[k, g + 1]):
+        for d in range(groups.first[k, g], groups.first[k, g + 1]):
+            P[own[c], own[d]] = record.Q_now[own[c], own[d]]
+    for other in range(groups.count[k]):
+        if sizes[other] > 0.0:
+            add_term(record, groups, k, g, other, total / sizes[other], P)
 
-    x: FloatArray
-    bounds: FloatArray
-    gap: Gap
-    start: Start
-    groups: tuple[np.ndarray, ...]
-    model: Any
-    places: dict[Key, np.ndarray]
-    blocks: tuple[Key, ...]
-    waits: bool
 
-
-class Told(NamedTuple):
-    """What a node sends: its estimate (n',) of its ``blocks``, with the bound P (n', n'). Where a
-    message may take time also all that is needed to predict them: what it knows of the ``whole``
-    state, see PartitionState.
+@kernel
+def predict(record: Any, h: int, run: Any) -> None:
+    """Predict node ``h``. Bounds follow from those at the last use in one step, so that they do not
+    depend on how often somebody looks.
     """
+    set_gap(record, h, run)
+    T, L, same = record.T, len(run.lanes), are_alike(record.bounds, h)
+    move_vector(T, record.x, h, record.row)
+    move_vector(T, record.start_x, h, record.row)
+    same = same and are_alike(record.Phi, h) and are_alike(record.Q, h)
+    # Runs in which the same has happened have the same covariances, which take most of the time.
+    step = L if same else 1
+    for q in range(0, L, step):
+        move_columns(T, record.Phi, h, q, record.row)
+        move_covariance(record, record.Q, h, q)
+        move_covariance(record, record.start_P, h, q)
+        find_present(record, h, q, q + step)
+        copy_lane(record.Phi, h, q, q + step)
+        copy_lane(record.Q, h, q, q + step)
+        copy_lane(record.start_P, h, q, q + step)
 
-    xhat: FloatArray
-    P: FloatArray
-    blocks: tuple[Key, ...]
-    whole: tuple[FloatArray, FloatArray, tuple[np.ndarray, ...]] | None
+
+@kernel
+def find_present(record: Any, h: int, q: int, end: int) -> None:
+    """Write the estimate of each group now: by what was used last, or, where that has become worse,
+    by what was known at the start. Covariances are those of lane ``q``, in all up to ``end``.
+    """
+    n, groups, P = len(record.T), record.groups, record.now_P
+    for i in range(n):
+        for p in range(q, end):
+            record.now_x[i, p] = record.x[h, i, p]
+        for j in range(n):
+            record.Phi_now[i, j], record.Q_now[i, j] = record.Phi[h, i, j, q], record.Q[h, i, j, q]
+            record.bounds_now[i, j] = record.bounds[h, i, j, q]
+    P[:] = 0.0
+    for g in range(groups.count[h]):
+        bound_after(record, groups, h, g, P)
+        own = groups.member[h, groups.first[h, g] : groups.first[h, g + 1]]
+        trace = known = 0.0
+        for i in own:
+            trace += P[i, i]
+            known += record.start_P[h, i, i, q]
+        if trace > known:
+            for i in own:
+                for p in range(q, end):
+                    record.now_x[i, p] = record.start_x[h, i, p]
+                for j in own:
+                    P[i, j] = record.start_P[h, i, j, q]
+    write_estimate(record, h, q, end)
+
+
+@kernel
+def write_estimate(record: Any, h: int, q: int, end: int) -> None:
+    """Make the estimates of all groups, ``now_x`` and ``now_P``, those of node ``h``."""
+    n, root = len(record.T), record.term
+    for i in range(n):
+        for p in range(q, end):
+            record.xhat[h, i, p] = record.now_x[i, p]
+        for j in range(n):
+            root[i, j] = record.now_P[i, j]
+    semidefinite_root(root, n)
+    for i in range(n):
+        for j in range(n):
+            record.root[h, i, j, q] = root[i, j] if j <= i else 0.0
+    copy_lane(record.root, h, q, end)
+
+
+@kernel
+def read_estimate(
+    x: FloatArray, root: FloatArray, place: tuple[int, int, int], order: np.ndarray,
+    group: np.ndarray, out: tuple[FloatArray, FloatArray],
+) -> None:  # fmt: skip
+    """Write estimate number m and the bounds within each ``group`` (N,) into ``out``, of the lanes
+    from q up to ``end``, ``place`` = (m, q, end); component i is number ``order[i]``.
+    """
+    (m, q, end), (means, P), n = place, out, len(order)
+    for i in range(n):
+        for p in range(q, end):
+            means[i, p] = x[m, order[i], p]
+        for j in range(n):
+            a, b, total = order[i], order[j], 0.0
+            for c in range(min(a, b) + 1 if group[i] == group[j] else 0):
+                total += root[m, a, c, q] * root[m, b, c, q]
+            P[i, j] = total
+
+
+@kernel
+def begin_anew(record: Any, h: int, q: int, end: int) -> None:
+    """Let node ``h`` go on from the estimates of all groups now."""
+    for i in range(len(record.T)):
+        for p in range(q, end):
+            record.x[h, i, p] = record.now_x[i, p]
+            for j in range(len(record.T)):
+                record.bounds[h, i, j, p] = record.now_P[i, j]
+                record.Phi[h, i, j, p], record.Q[h, i, j, p] = 1.0 if i == j else 0.0, 0.0
+    write_estimate(record, h, q, end)
+
+
+@kernel
+def take_group(record: Any, h: int, g: int) -> int:
+    """Make the estimate of group ``g`` the one to be updated; return the number of its states."""
+    f, groups, at = record.fusion, record.groups, record.at
+    f.n = groups.first[h, g + 1] - groups.first[h, g]
+    for i in range(f.n):
+        at[i] = groups.member[h, groups.first[h, g] + i]
+    for i in range(f.n):
+        for j in range(f.n):
+            f.P[i, j] = record.now_P[at[i], at[j]]
+    return int(f.n)
+
+
+@kernel
+def use(record: Any, count: int, q: int, end: int) -> None:
+    """Update the group taken with ``count`` rows, whose errors with the covariance ``heard`` may
+    correlate with that of the group.
+    """
+    f, at, z, x = record.fusion, record.at, record.z, record.now_x
+    correlated = False
+    for c in range(count):
+        for d in range(count):
+            f.told[c, d] = 0.0
+            correlated = correlated or f.heard[c, d] != 0.0
+    for i in range(f.n):
+        for j in range(f.n):
+            f.dependent[i, j] = f.P[i, j] if correlated else 0.0
+    if not fuse(f, count, CI if correlated else NAIVE):
+        return
+    for p in range(q, end):
+        for c in range(count):
+            for i in range(f.n):
+                z[c, p] -= f.H[c, i] * x[at[i], p]
+        for i in range(f.n):
+            for c in range(count):
+                x[at[i], p] += f.K[i, c] * z[c, p]
+    for i in range(f.n):
+        for j in range(f.n):
+            record.now_P[at[i], at[j]] = f.P[i, j]
+
+
+@kernel
+def update(record: Any, h: int, run: Any) -> None:
+    """Use readings of own blocks, and those of these and another group together, as observations
+    of the own blocks with the error of the other group.
+    """
+    r, group, L = run.reading, record.groups.number[h], len(run.lanes)
+    place, matrix = run.first_y + r, run.first_H + run.matrix[r]
+    # run.H may be that of all runs.
+    step = L if are_alike(record.root, h) and are_alike(run.H, matrix) else 1
+    for q in range(0, L, step):
+        end, says = q + step, False
+        for g in range(record.groups.count[h]):
+            count = 0
+            for c in range(run.rows[r]):
+                if group_of_row(run, matrix, c, q, group) == g:
+                    if not says:
+                        order, out = record.order, (record.now_x, record.now_P)
+                        read_estimate(record.xhat, record.root, (h, q, end), order, group, out)
+                        says = True
+                    add_row(record, run, (place, matrix, c), (q, end), group, count)
+                    count += 1
+            if count > 0:
+                use_rows(record, h, g, count)
+                use(record, count, q, end)
+        if says:
+            begin_anew(record, h, q, end)
+
+
+@kernel
+def group_of_row(run: Any, matrix: int, c: int, q: int, group: np.ndarray) -> int:
+    """Return the other group that row ``c`` of a reading depends on, 0 for none, -1 if it says
+    nothing.
+    """
+    found = -1
+    for i in range(len(group)):
+        if run.H[matrix, c, i, q] != 0.0:
+            found = max(found, group[i])
+    return found
+
+
+@kernel
+def add_row(
+    record: Any, run: Any, which: tuple[int, int, int], lanes: tuple[int, int],
+    group: np.ndarray, k: int,
+) -> None:  # fmt: skip
+    """Make a row of a reading number ``k`` of an observation, with its part in other groups."""
+    f, (place, matrix, c), own, (q, end) = record.fusion, which, 0, lanes
+    for p in range(q, end):
+        record.z[k, p] = run.y[place, c, p]
+    for i in range(len(group)):
+        entry = run.H[matrix, c, i, q]
+        record.others[k, i] = entry if group[i] > 0 else 0.0
+        if group[i] == 0:
+            f.H[k, own] = entry
+            own += 1
+        for p in range(q, end if group[i] > 0 else q):
+            record.z[k, p] -= entry * record.now_x[i, p]
+
+
+@kernel
+def use_rows(record: Any, h: int, g: int, count: int) -> None:
+    """Let the own blocks be updated with ``count`` white rows that depend on group ``g``, too."""
+    f, others, n = record.fusion, record.others, len(record.T)
+    for c in range(count):
+        for d in range(count):
+            f.heard[c, d] = 0.0
+            f.noise[c, d] = 1.0 if c == d else 0.0
+            for i in range(n if g > 0 else 0):
+                for j in range(n if others[c, i] != 0.0 else 0):
+                    f.heard[c, d] += others[c, i] * record.now_P[i, j] * others[d, j]
+    take_group(record, h, 0)
+
+
+@kernel
+def absorb(record: Any, h: int, run: Any) -> None:
+    """Use the messages of this instant one after the other, by sender."""
+    L, same = len(run.lanes), are_alike(record.root, h)
+    for k in range(run.count):
+        for q in range(1, L):
+            same = same and run.arrived[k, q] == run.arrived[k, 0]
+        same = same and are_alike(record.payload.root, run.message[k])
+    step = L if same else 1
+    for q in range(0, L, step):
+        says = False
+        for k in range(run.count):
+            if run.arrived[k, q] == 1:
+                if not says:
+                    out, place = (record.now_x, record.now_P), (h, q, q + step)
+                    order, group = record.order, record.groups.number[h]
+                    read_estimate(record.xhat, record.root, place, order, group, out)
+                    says = True
+                hear(record, h, run, k, q, q + step)
+        if says:
+            begin_anew(record, h, q, q + step)
+
+
+@kernel
+def hear(record: Any, h: int, run: Any, k: int, q: int, end: int) -> None:
+    """Use message ``k``: what its sender has of its own blocks, predicted to now."""
+    m, w, payload, x, P = (
+        run.message[k], run.link[k], record.payload, record.heard_x, record.heard_P
+    )  # fmt: skip
+    told, place = record.told.number[w], (m, q, end)
+    read_estimate(payload.xhat, payload.root, place, record.theirs[w], told, (x, P))
+    if run.age[k] > 0.0:
+        predict_message(record, h, run, k)
+    f, at, common = record.fusion, record.at, record.common
+    for g in range(record.groups.count[h]):
+        size, count, heard = take_group(record, h, g), 0, 0.0
+        for i in range(size):
+            if told[at[i]] == 0:
+                common[count] = at[i]
+                for j in range(size):
+                    f.H[count, j] = 1.0 if i == j else 0.0
+                count += 1
+        for c in range(count):
+            heard += P[common[c], common[c]]
+            for p in range(q, end):
+                record.z[c, p] = x[common[c], p]
+            for d in range(count):
+                f.heard[c, d], f.noise[c, d] = P[common[c], common[d]], 0.0
+        if count > 0:
+            use(record, count, q, end)
+        if count == size:
+            forget(record, size, heard, q, end)
+
+
+@kernel
+def forget(record: Any, size: int, heard: float, q: int, end: int) -> None:
+    """Replace what is known of the group taken by what was told of all of it, with the trace
+    ``heard``, if that is less.
+    """
+    at, before = record.at, 0.0
+    for i in range(size):
+        before += record.now_P[at[i], at[i]]
+    for i in range(size if heard < (1.0 - NO_GAIN) * before else 0):
+        for p in range(q, end):
+            record.now_x[at[i], p] = record.heard_x[at[i], p]
+        for j in range(size):
+            record.now_P[at[i], at[j]] = record.heard_P[at[i], at[j]]
+
+
+@kernel
+def predict_message(record: Any, h: int, run: Any, k: int) -> None:
+    """Predict what message ``k`` tells to now, with what its sender has of other blocks."""
+    x, P, gap, n = record.heard_x, record.heard_P, run.gap, len(record.T)
+    run.gap = run.age[k]
+    set_gap(record, h, run)
+    run.gap = gap
+    for i in range(n):
+        record.row[i] = x[i, 0]
+        for j in range(n):
+            record.Phi_now[i, j], record.Q_now[i, j] = record.T[i, j], record.W[i, j]
+            record.bounds_now[i, j] = P[i, j]
+    for i in range(n):
+        x[i, 0] = 0.0
+        for j in range(n):
+            x[i, 0] += record.T[i, j] * record.row[j]
+    bound_after(record, record.told, run.link[k], 0, P)
+
+
+@kernel
+def shift(record: Any, h: int, run: Any) -> None:
+    """Move all estimates of node ``h`` with the origin."""
+    shift_vector(run, record.xhat, h)
+    shift_vector(run, record.x, h)
+    shift_vector(run, record.start_x, h)
+
+
+def partition_record(
+    _filtering: Partition, infos: Sequence[NodeInfo], models: Sequence[Any]
+) -> Record:
+    """Return the record. A node keeps, besides the estimates of all groups now, what it last used:
+    ``x`` (N,), predicted to now, and the ``bounds`` (N, N) of that time, 0 between groups, with
+    ``Phi`` and ``Q`` of the time since; and what is known of the start, predicted to now.
+    """
+    n = len(models[0].information)
+    square = (n, n)
+    orders = [_blocks_in_order(info.blocks, info.whole, n) for info in infos]
+    pairs = list(zip(infos, orders, strict=True))
+    theirs, told = list[np.ndarray](), list[np.ndarray]()
+    for info, order in pairs:
+        for blocks in info.heard or ((),) * (len(infos) == 1):
+            sent = _blocks_in_order(blocks, info.whole, n)
+            numbers, of_sender = np.zeros(n, dtype=np.int64), _groups(blocks, sent, n)
+            for key, entries in order.items():
+                numbers[entries] = sent[key]
+            theirs.append(numbers)
+            told.append(of_sender[numbers])
+    rows = max(n, *(info.rows for info in infos))
+    return Record(
+        node={
+            **dict.fromkeys(("x", "start_x"), (n,)),
+            **dict.fromkeys(("bounds", "Phi", "Q", "start_P"), square),
+        },
+        payload=estimate_shapes(n),
+        scratch={
+            **dict.fromkeys(("now_x", "heard_x"), (n,)),
+            **{"moved_x": (1, n), "moved_root": (1, n, n), "z": (rows,)},
+        },
+        settings={
+            "groups": groups_of(np.array([_groups(i.blocks, order, n) for i, order in pairs])),
+            "theirs": np.reshape(theirs, (-1, n)).astype(np.int64),
+            "told": groups_of(np.reshape(told, (-1, n)).astype(np.int64)),
+            "order": np.arange(n),
+            "fusion": fusion_of(n, rows),
+            "others": np.zeros((rows, n)),
+            **{name: np.zeros(n, dtype=np.int64) for name in ("at", "common")},
+            **{name: np.zeros(n) for name in ("row", "sizes")},
+            **{
+                name: np.zeros(square)
+                for name in ("T", "W", "Phi_now", "Q_now", "bounds_now", "term", "now_P", "heard_P")
+            },
+        },
+    )
+
+
+def _blocks_in_order(own: Sequence[Place], whole: Sequence[Place], n: int) -> dict[Key, np.ndarray]:
+    """Return the entries of each block in the state of a node: its ``own`` ones come first."""
+    blocks = own or whole or (Place("plant", None, 0, n),)
+    keys = {place.key for place in blocks}
+    found, first = dict[Key, np.ndarray](), 0
+    for place in (*blocks, *(place for place in whole if place.key not in keys)):
+        found[place.key] = np.arange(first, first + place.n)
+        first += place.n
+    return found
+
+
+def _groups(own: Sequence[Place], order: dict[Key, np.ndarray], n: int) -> np.ndarray:
+    """Return the number of the group of each entry: 0 for ``own`` blocks, then by owner."""
+    numbers: dict[Any, int] = {}
+    keys, group = {place.key for place in own} or set(order), np.zeros(n, dtype=np.int64)
+    for key, entries in order.items():
+        if key not in keys:
+            owner = key if key[1] < 0 else key[1]
+            group[entries] = numbers.setdefault(owner, 1 + len(numbers))
+    return group
+
+
+def begin_partition(_filter: Partition, node: Any, info: NodeInfo, _model: Any) -> None:
+    """Set what is known at time 0."""
+    n = len(node["xhat"])
+    group = _groups(info.blocks, _blocks_in_order(info.blocks, info.whole, n), n)
+    node["x"][:] = node["start_x"][:] = node["xhat"]
+    node["start_P"][:] = node["root"] @ node["root"].T
+    node["bounds"][:] = np.where(group[:, None] == group, node["start_P"], 0.0)
+    node["Phi"][:] = np.eye(n)
 
 
 @built_in("partition")
@@ -98,224 +606,21 @@ class Partition(Filter):
     Of a block that it does not estimate a node has what a neighbour told last, predicted by the
     plant, which all nodes know with its inputs and changes; while messages are lost the bound
     grows. Before it has heard of a block, and wherever the bound has become worse than that, it
-    has what was known at the start, predicted. What two nodes both estimate, and a reading of one
-    block of the node and one of another, is used by covariance intersection. P is never below the
-    covariance of the error. Under clocks, where messages may take time, they also tell what the
-    sender has of other blocks, by which the receiver predicts what it hears to the present.
+    has what was known at the start, predicted. What two nodes both estimate, and readings of blocks
+    of the node and of one other owner, are used by covariance intersection. P is never below the
+    covariance of the error. Messages that took time are predicted to the present with what the
+    sender has of other blocks.
     """
 
     needs = Needs(one_way=True, samples=True, blocks=True, coupled=True, linear_plant=True)
     analysis = Analysis(P_by_design=("larger", "larger"), affine=True)
-
-    def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> PartitionState:
-        """Return the state at time 0; mean and cov are of the whole state."""
-        n = len(mean)
-        places = {
-            place.key: np.arange(n)[place.entries]
-            for place in node.whole or (Place("plant", None, 0, n),)
-        }
-        blocks = tuple(place.key for place in node.blocks) or tuple(places)
-        own = np.concatenate([places[block] for block in blocks])
-        others: dict[Any, list[np.ndarray]] = {}
-        for key, entries in places.items():
-            if key not in blocks:
-                others.setdefault(key if key[1] < 0 else key[1], []).append(entries)
-        groups = (own, *(np.concatenate(parts) for parts in others.values()))
-        P = np.array(cov, dtype=np.float64)
-        bounds = np.zeros((n, n))
-        for group in groups:
-            bounds[np.ix_(group, group)] = P[np.ix_(group, group)]
-        gap, start = Gap(np.eye(n), np.zeros((n, n))), Start(np.array(mean), P)
-        waits = node.max_delay > 0.0
-        return PartitionState(
-            np.array(mean), bounds, gap, start, groups, model, places, blocks, waits
-        )
-
-    def predict(self, state: PartitionState, gap: float) -> PartitionState:
-        """Return the state ``gap`` seconds later. Bounds follow from those at the last use in one
-        step, so that they do not depend on how often somebody looks.
-        """
-        n, (before, noise), start = len(state.x), state.gap, state.start
-        Phi = state.model.transition(np.zeros(n), gap)
-        x, root = state.model.predict(state.x, np.zeros((n, n)), gap)
-        mean, _ = state.model.predict(start.mean, root, gap)
-        Q = root @ root.T
-        return state._replace(
-            x=x,
-            gap=Gap(Phi @ before, symmetric(Phi @ noise @ Phi.T + Q)),
-            start=Start(mean, symmetric(Phi @ start.cov @ Phi.T + Q)),
-        )
-
-    def _part(self, state: PartitionState, group: np.ndarray) -> tuple[FloatArray, FloatArray]:
-        """Return the estimate (k,) and bound (k, k) of a group now."""
-        P = _bound_after(state.gap, state.bounds, state.groups, group)
-        mean, cov = state.start
-        known = cov[np.ix_(group, group)]
-        return (state.x[group], P) if np.trace(P) <= np.trace(known) else (mean[group], known)
-
-    def _present(self, state: PartitionState) -> tuple[FloatArray, FloatArray]:
-        """Return estimate (n,) and bounds (n, n) of all groups now."""
-        x, bounds = np.zeros_like(state.x), np.zeros_like(state.bounds)
-        for group in state.groups:
-            x[group], bounds[np.ix_(group, group)] = self._part(state, group)
-        return x, bounds
-
-    def _used(self, state: PartitionState, x: FloatArray, bounds: FloatArray) -> PartitionState:
-        """Return the state that begins anew from an estimate (n,) and bounds (n, n)."""
-        n = len(x)
-        return state._replace(x=x, bounds=bounds, gap=Gap(np.eye(n), np.zeros((n, n))))
-
-    def update(self, state: PartitionState, reading: Reading) -> PartitionState:
-        """Return the state after readings of its own blocks, and of one of these and another."""
-        if not len(reading.y) and not reading.pairs:
-            return state
-        x, bounds = self._present(state)
-        own = state.groups[0]
-        square = np.ix_(own, own)
-        xhat, P = x[own], bounds[square]
-        if len(reading.y):
-            y, H, R = reading.y, reading.H, reading.R
-            xhat, P = _used_as_is(xhat, P, y, H, R)
-        for pair in reading.pairs:
-            xhat, P = self._with_pair(xhat, P, pair, (state, x, bounds))
-        x[own], bounds[square] = xhat, P
-        return self._used(state, x, bounds)
-
-    def _with_pair(
-        self,
-        xhat: FloatArray,
-        P: FloatArray,
-        pair: PairReading,
-        known: tuple[PartitionState, FloatArray, FloatArray],
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return estimate and bound after a reading of another block, of which all is ``known``."""
-        state, x, bounds = known
-        other = state.places[pair.other]
-        z, H, H_other = pair.H(xhat, x[other])
-        C = H_other @ bounds[np.ix_(other, other)] @ H_other.T
-        return _intersected(xhat, P, z - H_other @ x[other], H, (C, pair.R))
-
-    def emit(self, state: PartitionState, exchange: Exchange) -> tuple[PartitionState, Told]:
-        """Return the estimate of its own blocks as a message."""
-        whole = (*self._present(state), state.groups) if state.waits else None
-        return state, Told(*self.estimate(state), state.blocks, whole)
-
-    def absorb(
-        self, state: PartitionState, messages: Sequence[Message], exchange: Exchange
-    ) -> PartitionState:
-        """Return the state after all messages of this instant, one after the other by sender."""
-        if not messages:
-            return state
-        x, bounds = self._present(state)
-        for message in messages:
-            told = message.payload
-            xhat, P = _predicted(state.model, told, message.age)
-            entries = np.concatenate([state.places[block] for block in told.blocks])
-            for group in state.groups:
-                common, mine, theirs = np.intersect1d(group, entries, return_indices=True)
-                if len(common):
-                    square, H = np.ix_(group, group), np.eye(len(group))[mine]
-                    z, C = xhat[theirs], P[np.ix_(theirs, theirs)]
-                    fused = _intersected(x[group], bounds[square], z, H, (C, 0.0 * C))
-                    x[group], bounds[square] = fused
-        return self._used(state, x, bounds)
-
-    def estimate(self, state: PartitionState) -> tuple[FloatArray, FloatArray]:
-        """Return xhat (n',) and P (n', n') of the blocks that the node estimates."""
-        return self._part(state, state.groups[0])
-
-    def shift(self, state: Any, offset: FloatArray) -> Any:
-        """Return a state, or a message, with ``offset`` (n,) added to estimates."""
-        if isinstance(state, Told):
-            whole = state.whole and (state.whole[0] + offset, *state.whole[1:])
-            return state._replace(xhat=state.xhat + offset, whole=whole)
-        start = state.start._replace(mean=state.start.mean + offset)
-        return state._replace(x=state.x + offset, start=start)
-
-
-def _bound_of_sum(terms: Sequence[FloatArray]) -> FloatArray:
-    """Return the bound (k, k) with the least trace of the covariance of a sum, of whose terms only
-    the covariances (k, k) are known.
-    """
-    parts = [(float(np.sqrt(np.trace(term))), term) for term in terms if term.any()]
-    total = sum(size for size, _ in parts)
-    return np.asarray(sum((total / size * term for size, term in parts), np.zeros_like(terms[0])))
-
-
-def _bound_after(
-    gap: Gap, bounds: FloatArray, groups: Sequence[np.ndarray], group: np.ndarray
-) -> FloatArray:
-    """Return the bound (k, k) of a group after a gap, from ``bounds`` (n, n) of all groups."""
-    terms = [
-        M @ bounds[other[:, None], other] @ M.T
-        for other in groups
-        for M in [gap.Phi[group[:, None], other]]
-    ]
-    return symmetric(_bound_of_sum(terms) + gap.Q[np.ix_(group, group)])
-
-
-def _predicted(model: Any, told: Told, age: float) -> tuple[FloatArray, FloatArray]:
-    """Return what a message told, estimate (n',) and bound (n', n'), ``age`` seconds later."""
-    if age <= 0.0 or told.whole is None:
-        return told.xhat, told.P
-    (x, bounds, groups), n = told.whole, len(told.whole[0])
-    x, root = model.extrapolate(x, np.zeros((n, n)), age)
-    gap = Gap(model.transition(np.zeros(n), age), root @ root.T)
-    return x[groups[0]], _bound_after(gap, bounds, groups, groups[0])
-
-
-def _used_as_is(
-    x: FloatArray, P: FloatArray, z: FloatArray, H: FloatArray, R: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the Kalman update of x (k,) and P (k, k) with ``z = H x + v``, cov(v) = R."""
-    # Singular where both are certain.
-    K = P @ H.T @ np.linalg.pinv(H @ P @ H.T + R, hermitian=True)
-    stays = np.eye(len(x)) - K @ H
-    return x + K @ (z - H @ x), symmetric(stays @ P @ stays.T + K @ R @ K.T)
-
-
-def _intersected(
-    x: FloatArray,
-    P: FloatArray,
-    z: FloatArray,
-    H: FloatArray,
-    covariances: tuple[FloatArray, FloatArray],
-) -> tuple[FloatArray, FloatArray]:
-    """Return x (k,) and P (k, k) after ``z = H x + e + v``, by the weight with the least trace;
-    ``covariances`` (C, R) are those of e, which may correlate with the error of x, and of v, which
-    does not.
-    """
-    C, R = covariances
-    if not C.any():
-        return _used_as_is(x, P, z, H, R)
-    choices = [(x, P)]
-    if len(z) == len(x) and not R.any():
-        # All is heard: what was known may be forgotten.
-        choices.append((H.T @ z, H.T @ C @ H))
-        differences = np.linalg.eigvalsh(P - choices[1][1])
-        if differences[0] >= 0.0 or differences[-1] <= 0.0:
-            return choices[int(differences[-1] > 0.0)]
-    w = _best_weight(P, H, C, R)
-    choices.append(_used_as_is(x, P / w, z, H, C / (1.0 - w) + R))
-    return min(choices, key=lambda choice: float(np.trace(choice[1])))
-
-
-def _best_weight(P: FloatArray, H: FloatArray, C: FloatArray, R: FloatArray) -> float:
-    """Return the weight w of P by which the trace, which is convex in w, becomes least."""
-    sizes, vectors = np.linalg.eigh(H @ P @ H.T + C + R)
-    # Of other directions nothing is known or learned; within these no sum below is singular.
-    V = vectors[:, sizes > len(sizes) * ROUNDING * sizes[-1]]
-    gain, size = V.T @ H @ P, float(np.trace(P))
-    A, C, R = gain @ H.T @ V, V.T @ C @ V, V.T @ R @ V
-
-    def slope(w: float) -> float:
-        left = 1.0 - w
-        X = np.linalg.solve(A + w / left * C + w * R, gain)
-        # The derivative, times w, of the trace (size - sum(gain X)) / w.
-        change = X * ((C / (left * left) + R) @ X)
-        return float(change.sum() - (size - (gain * X).sum()) / w)
-
-    least, largest = MARGIN, 1.0 - MARGIN
-    if slope(least) >= 0.0:
-        return least
-    return largest if slope(largest) <= 0.0 else float(scipy.optimize.brentq(slope, least, largest))
+    kernels = Kernels(
+        partition_record,
+        begin_partition,
+        predict=predict,
+        update=update,
+        absorb=absorb,
+        shift=shift,
+        means=("xhat", "x", "start_x"),
+    )
+    shift = Filter.shift  # affine in readings and messages

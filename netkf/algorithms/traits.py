@@ -38,8 +38,8 @@ class Needs:
              they speak, and it knows what to do with readings of a block that a node does not
              estimate (``Reading.pairs``)
     coupled : it knows the plant of all blocks, so that those that a node does not estimate may
-              drive the others: ``init`` gets the model, mean and cov of the whole state, and
-              ``NodeInfo.whole``
+              drive the others: its states and readings are of the whole state, the node's own
+              blocks first, and ``NodeInfo.whole`` says which blocks there are
     translate : without ``blocks``, how a node reads a message of one that estimates other blocks,
                 ``translate(payload, own, common)``: ``own`` is the payload that the node itself
                 would send, ``common`` says which states both estimate (``translation.Common``). By

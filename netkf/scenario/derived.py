@@ -246,8 +246,20 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def model_views(self) -> tuple[np.ndarray, ...] | None:
-        """The entries (n',) of the state of which each node has a model; None for all of it."""
-        return None if self.node_filter.needs.coupled else self.views
+        """The entries (n',) of the state of which each node has a model; None for all of it. They
+        begin with those that it estimates.
+        """
+        views = self.views
+        if views is None or not self.node_filter.needs.coupled:
+            return views
+        whole = np.arange(self.plant.n)
+        return tuple(np.append(view, np.setdiff1d(whole, view)) for view in views)
+
+    @property
+    def model_width(self) -> int:
+        """The largest number of states of which a node has a model."""
+        views = self.model_views
+        return self.plant.n if views is None else max(map(len, views))
 
     def view(self, k: int) -> Any:
         """Return the entries (n',) of the state that node number ``k`` estimates, or a slice."""
@@ -271,9 +283,9 @@ class DerivedScenario(ScenarioModel):
         self, k: int, placed: tuple[PlacedSensor, ...]
     ) -> tuple[FloatArray, FloatArray]:
         """Return H (p, n') and R (p, p) of sensors of node ``k`` that read only its own states."""
-        if self.views is None:
+        if self.model_views is None:
             return self._stack_sensors(placed, believed=True)
-        view = self.views[k]
+        view = self.model_views[k]
         own = tuple(p for p in placed if np.isin(self.support(p), view).all())
         H, R = self._stack_sensors(own, believed=True)
         return np.ascontiguousarray(H[:, view]), R

@@ -121,6 +121,10 @@ def _errors_of(scenario: Scenario, run: Run) -> ErrorColumns:
     _require_known_errors(scenario, run)
     if scenario.slotted:
         run = with_last_exchanges(scenario, run)
+    if scenario.model_views is not scenario.views and has_columns(scenario):
+        return SeenErrors(
+            (SlotColumns if scenario.slotted else ClockColumns)(scenario, run), scenario
+        )
     reads_kernels = scenario.node_filter.kernels is not None and scenario.common_entries
     if takes_columns(scenario.node_filter) and not reads_kernels:
         return (SlotBlocks if scenario.slotted else ClockBlocks)(scenario, run)

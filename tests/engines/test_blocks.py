@@ -9,6 +9,8 @@ import pytest
 
 import netkf
 from tests.algorithms.test_block_intersection import CLOCKED, ROBOTS, load
+from tests.algorithms.test_partition import AREAS, FLOWS
+from tests.algorithms.test_partition import clocked as clocked_areas
 from tests.engines.agreement import assert_agree
 
 POSES = """
@@ -155,6 +157,38 @@ def test_readings_of_pairs(tmp_path: Path, kind: str, estimates: str, linearise:
 @pytest.mark.parametrize("text", [ROBOTS, CLOCKED])
 def test_kept_cross_covariances(tmp_path: Path, text: str) -> None:
     assert_agree(load(text, tmp_path, filter={"kind": KEPT, "estimates": "own"}))
+
+
+PERIODIC = '\nsampling = { kind = "periodic", period = 0.7 }'
+CRASHES = {"kind": "duty", "nodes": [2, 3], "period": 5.0, "up": 3.0, "memory": "lost"}
+COUPLED = {
+    "as they are": {},
+    "delays": {"network.channel.delay": {"kind": "uniform", "low": 0.1, "high": 0.6}},
+    "crashes": {"network.lives": [CRASHES]},
+    "drift": {
+        "network.clocks": [{"nodes": [2], "drift": 0.02}],
+        "filter.model": {"input": False, "schedule": False},
+    },
+    "gate": {"filter.gate": {"probability": 0.8}},
+}
+
+
+@pytest.mark.one_in(4)
+@pytest.mark.parametrize("estimates", ["own", "own+neighbours", "all"])
+@pytest.mark.parametrize("case", COUPLED)
+@pytest.mark.parametrize("slotted", [True, False])
+def test_coupled_areas(tmp_path: Path, slotted: bool, case: str, estimates: str) -> None:
+    """With a reading across a border, an input, and a plant that changes."""
+    # In slots no clock is wrong.
+    changes = {} if slotted and case == "drift" else COUPLED[case]
+    text = AREAS if slotted else clocked_areas(AREAS)
+    key, noise = ("F", "") if slotted else ("A", PERIODIC)
+    text = text.replace("[network]", FLOWS.replace("R = [[0.05]]", "R = [[0.05]]" + noise), 1)
+    coupling = "coupling = [{ from = [2], A = [[0.3]] }]"
+    schedule = f"schedule = [{{ from = 6.0, {key} = [[-0.2]] }}]"
+    sine = 'input = { kind = "sine", G = [[2.0]], amplitude = 1.0, frequency = 0.1 }'
+    text = text.replace(coupling, "\n".join([coupling, schedule, sine]))
+    assert_agree(load(text, tmp_path, **{"filter.estimates": estimates}, **changes))
 
 
 @pytest.mark.slow

@@ -18,12 +18,12 @@ DIVERGED = CODES["diverged"]
 
 
 def entries_of(scenario: Scenario) -> np.ndarray:
-    """Return the entries (F, w) of the state that each filter estimates, -1 beyond the last."""
+    """Return the entries (F, w) of the state that each filter models, -1 beyond the last."""
     pooled, count = scenario.node_filter.timing.pooled, len(scenario.nodes)
     if scenario.views is None or pooled:
         return np.tile(np.arange(scenario.plant.n), (1 if pooled else count, 1))
-    entries = np.full((count, scenario.width), -1)
-    for h, view in enumerate(scenario.views):
+    entries = np.full((count, scenario.model_width), -1)
+    for h, view in enumerate(scenario.model_views or ()):
         entries[h, : len(view)] = view
     return entries
 

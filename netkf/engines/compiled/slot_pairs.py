@@ -155,7 +155,7 @@ def blocks_refusal(scenario: Scenario) -> str | None:
             return rule
     if any(hasattr(sensor, "C") for sensor in scenario.sensors):
         return "nodes of different states with regressors"
-    for node, view in zip(scenario.nodes, scenario.views or (), strict=True):
+    for node, view in zip(scenario.nodes, scenario.model_views or (), strict=True):
         for placed in scenario.placed_sensors.get(node, ()):
             if _reads_in_its_own_way(scenario, placed, node, view):
                 key = f"sensors[{scenario.sensor_entries[placed.entry]}]"

@@ -75,7 +75,7 @@ class SlotSetup:
         # A filter that all nodes share estimates the whole state.
         self.views = None if algorithm.timing.pooled else scenario.views
         self.forgets = bool(scenario.forgetful_nodes)
-        self.width = self.n if self.views is None else scenario.width
+        self.width = self.n if self.views is None else scenario.model_width
         self._set_slots(scenario)
         self._set_stages(scenario)
         self._set_sensors(scenario)

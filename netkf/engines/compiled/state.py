@@ -387,7 +387,7 @@ def wide_models(scenario: Scenario) -> list[Sequence[FlowModel]]:
     if scenario.views is None or scenario.node_filter.timing.pooled:
         return list(scenario.model_pieces)
     known: dict[Any, list[FlowModel]] = {}
-    w, columns = scenario.width, []
+    w, columns = scenario.model_width, []
     for models in zip(*scenario.model_pieces, strict=True):
         parts = [(m.A, m.Q, m.H, m.R) for m in models]
         key = tuple((M.shape, M.tobytes()) for part in parts for M in part)

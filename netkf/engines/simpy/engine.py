@@ -281,7 +281,7 @@ class _Simulation:
         for k, (node, (mean, cov)) in enumerate(zip(scenario.nodes, estimates, strict=True)):
             view = scenario.view(k)
             # A pooled filter estimates all.
-            chosen = view if nodes[node].view is None else slice(None)
+            chosen = view if nodes[node].view is None else slice(len(view))
             n, own = len(view), mean[chosen]
             error[k, :n] = local[view] - own
             xhat[k, :n] = own + origin[view]
@@ -313,13 +313,13 @@ def _nodes(scenario: Scenario, make: Callable[[int, int, tuple[int, ...]], Any])
 
 def _identify(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
     """Return the arguments of Node for ``node`` (id, -1: pooled) with index ``entity``."""
-    views = scenario.views
+    views = scenario.model_views
     view = None if node < 0 or views is None else views[entity]
     common = {i: entries for (i, j), entries in scenario.common_entries.items() if j == node}
     # -1: the pooled filter, which is not a node of the graph.
     model = scenario.model_of(entity)
     if scenario.tells_models:
-        model = DrivenModel(scenario, model, None if scenario.model_views is None else view)
+        model = DrivenModel(scenario, model, view)
     if isinstance(model, MapModel | RateModel):
         # It follows the time of one run.
         model = dataclasses.replace(model)

@@ -81,8 +81,8 @@ class BlockColumns(ErrorColumns):
         self._x = np.zeros((plant.n, 2 * plant.n + SPARE))
         self._x[:, MEAN], self._x[:, NOISE : self._used] = plant.start_mean, plant.start_root
         self._views: list[View | None] = [None] * self.estimators
-        if scenario.views is not None:
-            self._views = [View(view, scenario.layout.places, {}) for view in scenario.views]
+        for h, view in enumerate(scenario.model_views or ()):
+            self._views[h] = View(view, scenario.layout.places, {})
         self._models = [ColumnModel(scenario.model_of(h)) for h in range(self.estimators)]
         self._states = [self._begin(h) for h in range(self.estimators)]
         # What is under way, by whatever names it.
@@ -142,7 +142,7 @@ class BlockColumns(ErrorColumns):
             parts = whole if view is None else view.readings(*whole[0])
             for part in parts:
                 (pairs if isinstance(part, PairReading) else samples).append(part)
-        n = int(self._scenario.is_estimated[h].sum())
+        n = len(self._x) if view is None else len(view.entries)
         y = np.concatenate([self._x[:0], *(y for y, *_ in samples)])
         H = np.concatenate([np.empty((0, n)), *(H for _, H, _ in samples)])
         reading = Reading(y, H, block_diagonal([R for *_, R in samples]), time, tuple(pairs))
@@ -172,16 +172,16 @@ class BlockColumns(ErrorColumns):
         """Return the errors (M n, C): those of states that a node does not estimate are 0."""
         forms = np.zeros((self.estimators, self.n, self._x.shape[1]))
         for h, state in enumerate(self._states):
-            e = self._x[self._scenario.view(h)] - self._filter.estimate(state)[0]
-            forms[h, : len(e)] = e
+            x = self._x[self._scenario.view(h)]
+            forms[h, : len(x)] = x - self._filter.estimate(state)[0][: len(x)]
         return forms.reshape(-1, self._x.shape[1])
 
     def covariances(self) -> FloatArray:
         """Return P (M, n, n), with the variance 1 of states that a node does not estimate."""
         P = np.full((self.estimators, self.n, self.n), np.nan)
         for h, state in enumerate(self._states):
-            cov = cast(FloatArray, self._filter.estimate(state)[1])
-            P[h, : len(cov), : len(cov)] = cov
+            n = int(self._scenario.sizes[h])
+            P[h, :n, :n] = cast(FloatArray, self._filter.estimate(state)[1])[:n, :n]
         return without_padding(np.diagonal(P, axis1=1, axis2=2), P)[1]
 
 

@@ -71,9 +71,10 @@ def scenario_of_all(scenario: Scenario) -> Scenario:
 
 
 class SeenErrors(ErrorColumns):
-    """The errors of nodes that estimate blocks, from ``whole`` ones of nodes that estimate all and
-    do not talk: what a node has of blocks that nothing else drives, and from readings of these
-    alone, does not depend on the others.
+    """The errors of nodes that estimate blocks, from ``whole`` ones of nodes that estimate all. If
+    these do not talk, what a node has of blocks that nothing else drives, and from readings of
+    these alone, does not depend on the others; else they have the own blocks first
+    (``Needs.coupled``).
     """
 
     def __init__(self, whole: ErrorColumns, scenario: Scenario) -> None:
@@ -84,7 +85,8 @@ class SeenErrors(ErrorColumns):
         # Row of each error among the whole ones; the last one, 0, beyond the states of a node.
         self._rows = np.full((self.estimators, self.n), size)
         for h, view in enumerate(views):
-            self._rows[h, : len(view)] = h % whole.estimators * whole.n + view
+            own = np.arange(len(view)) if scenario.node_filter.needs.coupled else view
+            self._rows[h, : len(view)] = h % whole.estimators * whole.n + own
 
     def replay(self) -> Iterator[None]:
         """Replay the events of the run; yield at each of ``run.times``."""

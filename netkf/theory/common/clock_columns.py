@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from netkf.engines.compiled.life_tables import life_table
+from netkf.engines.compiled.samples import entries_of
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.network.node_clocks import node_times
 from netkf.rng.streams import Streams
@@ -60,7 +61,7 @@ class ClockColumns(LoggedColumns):
         self._forms_of_all = forms = Forms(scenario.plant.n * (len(scenario.nodes) + 1))
         plant = cast(Any, scenario.plant)
         self.n = plant.n
-        self._x = forms.take(self.n)
+        self._x, self._entries = forms.take(self.n), entries_of(scenario)
         first = forms.inputs(plant.start_root.shape[1])
         forms.table[self._x, MEAN] = plant.start_mean
         forms.table[self._x, first : forms.used] = plant.start_root
@@ -89,7 +90,7 @@ class ClockColumns(LoggedColumns):
         self._forgetful = frozenset(scenario.forgetful_nodes)
         # A node that begins again does so with a mean that does not move along, and one whose clock
         # is wrong is at another time.
-        movable = movable and not self._forgetful and not self._clocks
+        movable = movable and not (self._forgetful or self._clocks or scenario.views)
         self._checked, self._unit = 0.0, 1.0 / rate if movable else np.inf
         self._changes = plant.changes[plant.changes < scenario.horizon].tolist()
         self._begin_piece(0)
@@ -225,7 +226,7 @@ class ClockColumns(LoggedColumns):
             rows = forms.take(len(H))
             forms.table[rows, : forms.used] = y
             self._read[h] = time, H, rows
-        self._filters.update(h, self._gap(h, time), H, y)
+        self._filters.update(h, self._gap(h, time), H[:, self._entries[h]], y)
 
     def _send(self, key: tuple[int, int, int], time: float) -> None:
         node, peer, number = key
@@ -295,7 +296,7 @@ class ClockColumns(LoggedColumns):
     def _forms(self) -> FloatArray:
         table, used = self._forms_of_all.table, self._forms_of_all.used
         estimates = table[self._filters.xhat_rows.reshape(-1), :used]
-        return np.asarray(np.tile(table[self._x, :used], (self.estimators, 1)) - estimates)
+        return np.asarray(table[self._x[self._entries.ravel()], :used] - estimates)
 
     def covariances(self) -> FloatArray:
         """Return P (M, n, n) of the estimators."""

@@ -64,7 +64,8 @@ class SlotColumns(ErrorColumns):
         self._restarts = slot_restarts(scenario, self._lives)
         # The origin follows the true state, so that errors on unstable plants keep their digits,
         # but not the mean with which a node begins again.
-        self._framed = scenario.filters_know_the_truth and not self._setup.forgets
+        framed = scenario.filters_know_the_truth and not self._setup.forgets
+        self._framed = framed and scenario.views is None
         # The true state (n, columns).
         self._x = np.column_stack([np.zeros(self.n), plant.start_mean, plant.start_root])
         self._filters = self._begin()
@@ -177,7 +178,7 @@ class SlotColumns(ErrorColumns):
             whitened, noise = self._whiten(observation)
             y[h, :rows, :columns] = whitened @ self._x
             y[h, :rows, first : first + noises] += noise
-            H[0, 0, h, :rows] = whitened[..., None]
+            H[0, 0, h, :rows] = whitened[:, setup.entries[h], None]
             first += noises
         y = y.reshape(*y.shape[:2], blocks, LANES).transpose(2, 0, 1, 3)[:, None]
         algorithm, steps = setup.algorithm, len(setup.fresh)
@@ -248,7 +249,7 @@ class SlotColumns(ErrorColumns):
     def _forms(self) -> FloatArray:
         """Return the errors (M n, C - 1): the means, and the columns of noises."""
         estimates = self._matrix("xhat")
-        return np.asarray(np.tile(self._x, (self.estimators, 1)) - estimates)[:, MEAN:]
+        return np.asarray(self._x[self._setup.entries.ravel()] - estimates)[:, MEAN:]
 
     def covariances(self) -> FloatArray:
         """Return P (M, n, n) of the estimators."""
