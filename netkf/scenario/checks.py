@@ -292,7 +292,7 @@ def _check_clocks(scenario: DerivedScenario) -> None:
     elif recorded:
         why, nodes = "cannot be of nodes whose readings are recorded, with their stamps", recorded
         remedy = "leave these out, and write into their tables the stamps that filters believe"
-    elif scenario.input_responses is not None or len(scenario.followed_changes):
+    elif (scenario.plant.linear and scenario.knows_input) or len(scenario.followed_changes):
         why = "cannot stand beside inputs or changes of a linear plant that filters know"
     if clocks and why is not None:
         raise ScenarioError("network.clocks", why, sorted(nodes), remedy)
@@ -327,7 +327,7 @@ def _check_quantisation(scenario: DerivedScenario) -> None:
     kernels = compiled_kernels(algorithm, not scenario.slotted)
     if kernels is not None and (kernels.sends_readings or kernels.shift_payload is nothing):
         why = f"cannot be with the {filter_name(scenario)}, whose messages have readings or bits"
-    elif scenario.input_responses is not None:
+    elif scenario.plant.linear and scenario.knows_input:
         why = "cannot stand beside an input of a linear plant that filters know"
     elif scenario.views is not None:
         why = "cannot stand beside nodes that estimate different blocks"
