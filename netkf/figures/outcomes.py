@@ -62,9 +62,7 @@ def fate_figure(data: FigureData) -> Picture:
         reason = "No two nodes could hear the same transmission, or they lost all or nothing."
         raise UnavailableError(reason)
     mean = float(np.nanmean(fates))
-    headline = f"Hearers of one broadcast share its fate: mean correlation {mean:.2f}"
-    if abs(mean) < 0.05:
-        headline = f"Hearers of one broadcast lose it independently: mean correlation {mean:.2f}"
+    headline = f"Outcomes of one broadcast at two hearers correlate by {mean:.2f} on average"
     axes, figure = _draw_matrix(data.nodes, fates, (-1.0, 1.0), "RdBu_r", "correlation of outcomes")
     axes.set(xlabel="hearer", ylabel="hearer")
     note = (

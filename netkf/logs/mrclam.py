@@ -18,6 +18,7 @@ import pandas as pd
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import MAX_MAGNITUDE
+from netkf.core.printable import count_phrase
 from netkf.linalg.arrays import FloatArray
 
 HOLE = 0.5  # seconds without a row of odometry, or of true poses, that a note tells
@@ -191,7 +192,7 @@ def _name_subjects(
     usable = to.isin(known) & (to != rows["node"])
     unknown = rows[~usable].groupby("barcode").size()
     if len(unknown):
-        listed = ", ".join(f"{code} ({count})" for code, count in unknown.items())
+        listed = ", ".join(f"{code} ({count_phrase(n, 'row')})" for code, n in unknown.items())
         notes.append(f"readings of barcodes of no other robot or landmark are left out: {listed}")
     return rows.assign(barcode=to)[usable].rename(columns={"barcode": "to"})
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from netkf.core.printable import count_phrase
 from netkf.network.clocks import LinkClock, RecordedClock
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.scenario.registry import name_of
@@ -112,9 +113,9 @@ def _reach_row(scenario: Scenario) -> AssumptionRow:
     graph = networkx.DiGraph(topology.directions)
     graph.add_nodes_from(topology.nodes)
     parts = networkx.number_strongly_connected_components(graph)
-    evidence = f"{len(topology.nodes)} nodes, {len(topology.links)} links" + (
-        ", directed" if topology.directed else ""
-    )
+    counts = {"node": len(topology.nodes), "link": len(topology.links)}
+    evidence = ", ".join(count_phrase(count, what) for what, count in counts.items())
+    evidence += ", directed" if topology.directed else ""
     if parts > 1:
         evidence += f"; {parts} groups of nodes that reach each other both ways"
     return ("every node can hear of every other, over others", ANY, parts == 1, evidence)

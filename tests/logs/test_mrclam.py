@@ -60,7 +60,7 @@ def test_every_number_is_that_of_the_log(log, tmp_path, capsys):
         "Robot2_Odometry.dat: gaps of more than 0.5 s: 1, the longest 1.5 s after t = 100.0",
         "Robot2_Measurement.dat: rows that repeat a reading: 1",
         "Robot2_Measurement.dat: rows that are earlier than the one before were sorted: 1",
-        "barcodes of no other robot or landmark are left out: 14 (1), 34 (1)",
+        "barcodes of no other robot or landmark are left out: 14 (1 row), 34 (1 row)",
     ):
         assert note in printed
     scenario = netkf.load(out / "scenario.toml")

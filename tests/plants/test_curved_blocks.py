@@ -161,6 +161,9 @@ def test_nodes_that_estimate_their_own_block_have_its_filter(scenario):
         own = run.block("pose", node)
         np.testing.assert_allclose(own.xhat, whole.xhat[:, 0, entries], atol=1e-12)
         np.testing.assert_allclose(own.P, whole.P[:, 0, entries, entries], atol=1e-12)
+    # Nothing that no theory has of them is called known.
+    with pytest.raises(netkf.TheoryError, match="different blocks of the state$"):
+        netkf.theory.covariance_bound(scenario.replace(changes), run.times)
 
 
 @pytest.mark.one_in(2)

@@ -6,6 +6,7 @@ from collections import Counter
 
 import numpy as np
 
+from netkf.core.printable import count_phrase
 from netkf.linalg.arrays import FloatArray, is_definite
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import AssumptionRow, judge_plant, true_model_row
@@ -16,8 +17,9 @@ from netkf.theory.numerics.matrices import unobservable_mode
 def connected_row(scenario: Scenario, source: str) -> AssumptionRow:
     """Return the row that the graph is undirected and connected, by ``source``."""
     topology, parts = scenario.topology, len(scenario.topology.components)
-    evidence = f"{len(topology.nodes)} nodes, {len(topology.links)} links, {parts} part"
-    evidence += ("" if parts == 1 else "s") + (", directed" if topology.directed else "")
+    counts = {"node": len(topology.nodes), "link": len(topology.links), "part": parts}
+    evidence = ", ".join(count_phrase(count, what) for what, count in counts.items())
+    evidence += ", directed" if topology.directed else ""
     holds = parts == 1 and not topology.directed
     return "the graph is undirected and connected", source, holds, evidence
 

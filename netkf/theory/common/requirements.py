@@ -54,10 +54,9 @@ def scenario_of_estimates(scenario: Scenario) -> Scenario:
         return scenario
     if have_one_view(scenario):
         return scenario_of_view(scenario)
-    raise TheoryError(
-        "not known of nodes that estimate different blocks of the state; of these are known "
-        "theory.central_covariance and theory.error_covariance"
-    )
+    known = "; known are theory.central_covariance and theory.error_covariance"
+    reason = "not known of nodes that estimate different blocks of the state"
+    raise TheoryError(reason + (known if scenario.is_linear else ""))
 
 
 def _check_first_argument(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
