@@ -162,7 +162,7 @@ def test_nodes_that_estimate_their_own_block_have_its_filter(scenario):
         np.testing.assert_allclose(own.xhat, whole.xhat[:, 0, entries], atol=1e-12)
         np.testing.assert_allclose(own.P, whole.P[:, 0, entries, entries], atol=1e-12)
     # Nothing that no theory has of them is called known.
-    with pytest.raises(netkf.TheoryError, match="different blocks of the state$"):
+    with pytest.raises(netkf.TheoryError, match=r"different blocks of the state$"):
         netkf.theory.covariance_bound(scenario.replace(changes), run.times)
 
 
