@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from netkf.linalg.arrays import FloatArray
 from netkf.plants.readings import covariance_of
 from netkf.rng.streams import Streams
+from netkf.runs.outcomes import Downtime, downtimes
 from netkf.runs.simulate import simulate
 from netkf.scenario.model import PlacedSensor
 from netkf.scenario.sampling import times_of_sensor
@@ -61,8 +62,8 @@ def collect_readings(
     all_slots: bool = False,
     engine: str = "auto",
 ) -> Readings:
-    """Return what the ``placed`` sensors read in a ``replica`` after time 0; ``simulated`` by an
-    ``engine`` too if readings are drawn. Raises ScenarioError and EngineError.
+    """Return what the ``placed`` sensors of nodes that are up read in a ``replica`` after time 0;
+    ``simulated`` by an ``engine`` too if readings are drawn. Raises ScenarioError and EngineError.
     """
     streams = Streams(seed, replica)
     numbers = {
@@ -86,6 +87,7 @@ def collect_readings(
         states = np.nan_to_num(run.x)
     origin = _known_response(scenario, times)
     readings: list[SensorReading] = []
+    down = downtimes(scenario, seed, replica)
     for node, sensors in placed.items():
         for one in sensors:
             key = node, one.ordinal
@@ -93,9 +95,23 @@ def collect_readings(
             of_sensor = _readings_of(
                 scenario, streams, (node, one), numbers[key], rows, states - origin
             )
-            readings += of_sensor
+            at = scenario.time_grid.snap(times + _sensing_delay(scenario))
+            readings += (r for r in of_sensor if not _is_down(down, node, float(at[r.number])))
     readings.sort(key=lambda one: one.number)
     return Readings(times, readings, run, origin)
+
+
+def _sensing_delay(scenario: Scenario) -> float:
+    """Return the seconds from the beginning of a slot until its reading is used."""
+    timing = scenario.node_filter.timing
+    before, found, _ = " ".join(timing.schedule or ()).partition("sense")
+    delays = scenario.slotted and found and timing.talks
+    return before.count("exchange") * scenario.phase_length if delays else 0.0
+
+
+def _is_down(downtimes: Sequence[Downtime], node: int, t: float) -> bool:
+    """Return True if a ``node`` (id) is down at ``t``, and does not sense."""
+    return any(one.node == node and one.begin <= t < one.end for one in downtimes)
 
 
 def _known_response(scenario: Scenario, times: FloatArray) -> FloatArray:

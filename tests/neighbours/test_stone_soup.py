@@ -1,6 +1,7 @@
 """Runs as objects of Stone Soup, with its own metrics, predictors and updaters."""
 
 import datetime
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -53,6 +54,19 @@ def test_detections_are_the_readings(run):
     ]
     assert len(nis) > 30
     assert abs(np.mean(nis) - 1.0) < 4.0 * np.sqrt(2.0 / len(nis))
+
+
+@pytest.mark.parametrize("name", ["poisson_ring", "gossip_ring"])
+def test_a_node_that_is_down_detects_nothing(name):
+    lives = {"kind": "crashes", "nodes": [0, 1], "mean_up": 3.3, "mean_down": 1.7}
+    changes = {"horizon": 20.0, "network.lives": [lives]}
+    if name == "poisson_ring":
+        changes["sensors.0.sampling"] = {"kind": "poisson", "rate": 2.0}
+    run = netkf.simulate(netkf.load(SCENARIOS / f"{name}.toml").replace(changes), seed=2)
+    senses = run.events[(run.events.kind == "sense") & (run.events.t > 0.0)]
+    found = Counter(one.metadata["node"] for one in run.to_stonesoup().detections)
+    assert found == Counter(senses.node.tolist())
+    assert (run.events.kind == "crash").any()
 
 
 def test_the_tracker_of_a_node_gives_what_local_gives(slot_run):

@@ -313,6 +313,11 @@ class Flat(Swing):
         return super().f(x, u, t)[:1]
 
 
+class Imaginary(Swing):
+    def f(self, x, u, t):
+        return super().f(x, u, t) + 1j
+
+
 class Half:
     def f(self, x, u, t):
         return x
@@ -425,6 +430,7 @@ def test_modules_need_trust_and_travel_with_the_run(custom):
         ({"plant.f": "bicycle"}, 'plant.f: must be one of "unicycle", "coordinated-turn"'),
         ({"plant.f": "swings:Half"}, "plant.f: must have a method jacobian(x, u, t)"),
         ({"plant.f": "swings:Nobody"}, "plant.f: could not be imported"),
+        ({"plant.f": "swings:Imaginary"}, "plant.f: f failed at plant.mean (TypeError: no real n"),
         ({"plant.f": "swings:Flat"}, "plant.f: f failed at plant.mean (ValueError: returned shape"),
         ({"plant.f": "unicycle"}, "plant.Q: must have 3 rows, for x, y and heading"),
         ({"plant.f": "coordinated-turn"}, "plant.Q: must have 5 rows"),
