@@ -15,6 +15,7 @@ import pandas as pd
 
 from netkf.core.errors import ScenarioError
 from netkf.core.printable import count_phrase
+from netkf.linalg.arrays import FloatArray
 from netkf.logs.packet_tables import find_extra, read_positions
 from netkf.logs.packets import (
     PacketLog,
@@ -141,17 +142,33 @@ def _number_bursts(table: pd.DataFrame, notes: list[str]) -> np.ndarray:
 
 def _transmissions(table: pd.DataFrame) -> tuple[pd.DataFrame, int]:
     """Return all packets of all bursts, and how many bursts have stamps that fit no beginning."""
-    parts, off = [], 0
-    for burst, rows in table.groupby("burst", sort=True):
-        step = float(rows["txifdur"].iloc[0]) / 1000.0
-        count = int(rows["txnumpk"].max())
-        begins = rows["t"] - rows["pkctr"] * step
-        # A stamp of whole seconds says that the packet came in this second.
-        low, high = float(begins.max()), float(begins.min()) + 1.0
-        off += low >= high
-        begin = round(0.5 * (low + high), 3)
-        numbers = np.arange(count)
-        part = {"burst": burst, "number": numbers, "t": np.round(begin + numbers * step, 6)}
-        part |= {"sender": rows["srcmac"].iloc[0], "channel": f"{rows['frequency'].iloc[0]:g}"}
-        parts.append(pd.DataFrame(part))
+    groups = table.groupby("burst", sort=True)
+    step, count = groups["txifdur"].first() / 1000.0, groups["txnumpk"].max().astype(int)
+    begins = (table["t"] - table["pkctr"] * table["txifdur"] / 1000.0).groupby(table["burst"])
+    # A stamp of whole seconds says that the packet came in this second.
+    low, high = begins.max(), begins.min() + 1.0
+    off = int((low >= high).sum())
+    begin = 0.5 * (low + high)
+    order = groups[["srcmac", "t", "transctr"]].min().sort_values(["srcmac", "t", "transctr"])
+    for _, own in order.groupby("srcmac"):
+        place = own.index
+        begin[place] = _in_turn(*(x[place].to_numpy() for x in (low, high, step * count)))
+    parts = []
+    for burst, rows in groups:
+        numbers = np.arange(count[burst])
+        t = np.round(np.round(begin[burst], 3) + numbers * step[burst], 6)
+        part = {"burst": burst, "number": numbers, "t": t, "sender": rows["srcmac"].iloc[0]}
+        parts.append(pd.DataFrame(part | {"channel": f"{rows['frequency'].iloc[0]:g}"}))
     return pd.concat(parts, ignore_index=True).assign(to="", sent=True, logged=False), off
+
+
+def _in_turn(low: FloatArray, high: FloatArray, length: FloatArray) -> FloatArray:
+    """Return beginnings between ``low`` and ``high``, the middle where there is room, of bursts of
+    one sender that end before the next one begins where stamps allow it.
+    """
+    early, late = low.copy(), high.copy()
+    for k in range(1, len(low)):
+        early[k] = max(low[k], min(early[k - 1] + length[k - 1], high[k]))
+    for k in range(len(low) - 2, -1, -1):
+        late[k] = min(high[k], max(late[k + 1] - length[k], low[k]))
+    return np.asarray(np.where(early <= late, early + late, low + high) / 2.0)

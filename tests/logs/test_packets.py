@@ -304,6 +304,23 @@ def test_mercator(tmp_path, yes, no):
     assert ((stamps <= received) & (received < stamps + 1)).all()
 
 
+def test_bursts_of_mercator_within_one_second_stay_apart(tmp_path):
+    """Three bursts of 0.21 s in each second: packet k of burst b is heard where k + b is even."""
+    rows = [MERCATOR.splitlines()[0]]
+    for burst in range(12):
+        for k in range(burst % 2, 3, 2):
+            stamp = f"2014-09-07_22.41.{23 + burst // 3}"
+            rows.append(f"{stamp},22-22,11,100,-75,1,1,11-11,{burst},{k},3,0,70,100,0x0a")
+        rows.append(f"{stamp},33-33,11,100,-75,1,1,11-11,{burst},0,3,0,70,100,0x0a")
+    _, notes = netkf.import_log(write(tmp_path / "raw.csv", rows), "mercator", tmp_path / "out")
+    outcomes = table(tmp_path / "out", "outcomes.csv").groupby("receiver")["delivered"]
+    assert outcomes.get_group("22-22").tolist() == [1, 0, 1, 0, 1, 0] * 6
+    assert outcomes.get_group("33-33").tolist() == [1, 0, 0] * 12
+    assert not any(note.startswith("moved") for note in notes)
+    times = table(tmp_path / "out", "transmissions.csv")["t"]
+    assert (times // 1.0).tolist() == [1.0 + burst // 3 for burst in range(12) for _ in range(3)]
+
+
 @pytest.mark.parametrize("column", ["mac", "srcmac", "txnumpk"])
 def test_rows_of_mercator_that_make_no_sense_are_dropped(tmp_path, column):
     """Motes without a name, and a burst of more packets than fit in memory."""
