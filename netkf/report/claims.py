@@ -342,12 +342,16 @@ def _describe_ensemble(source: ReportSource) -> list[str]:
 
 
 def _describe_bound(source: ReportSource) -> list[str]:
+    return [text + PAPER if "H(" in text else text for text in _bound_sentence(source)]
+
+
+def _bound_sentence(source: ReportSource) -> list[str]:
     summary = source.summary
     if not summary:
         return []
     rows = [row for row in summary["nodes"] if row["bound"] and row["mean_trace"] is not None]
     if not rows:
-        return [f"No bound: {summary.get('bound', 'unknown')}{PAPER}"]
+        return [f"No bound: {summary.get('bound', 'unknown')}"]
     # The text is like "H(12), promised by ...": the name of the bound comes first.
     bound = summary["bound"].split(",")[0]
     # The node with the largest ratio need not be one that exceeds the bound beyond its error.
@@ -370,14 +374,14 @@ def _describe_bound(source: ReportSource) -> list[str]:
     if exceeding:
         return [
             f"The bound of {bound} is exceeded by more than {margin:.2g} standard errors at "
-            f"{len(exceeding)} of {len(rows)} nodes; most: {numbers}{PAPER}"
+            f"{len(exceeding)} of {len(rows)} nodes; most: {numbers}"
         ]
     if source.runs > 1:
-        return [f"The bound of {bound} holds; closest: {numbers}{PAPER}"]
+        return [f"The bound of {bound} holds; closest: {numbers}"]
     side = "below" if ratio <= 1.0 else "above"
     return [
         f"The bound of {bound} is about the mean over runs. In this one run "
-        f"P was {side} it: largest {numbers}. netkf check decides if it holds{PAPER}"
+        f"P was {side} it: largest {numbers}. netkf check decides if it holds"
     ]
 
 

@@ -55,8 +55,8 @@ def check_derivatives(
     for again, before, method in ((function, value, of), (jacobian, J, "jacobian")):
         remedy = f"let it depend on {arguments} alone; noise is added by netkf"
         rule = f"must be the same for equal {arguments}"
-        demand(np.array_equal(again(x.copy()), before), f"{name}.{method}", rule, remedy=remedy)
         demand(np.isfinite(before).all(), f"{name}.{method}", "must be finite", before)
+        demand(np.array_equal(again(x.copy()), before), f"{name}.{method}", rule, remedy=remedy)
     rule = f"must be {len(value)} x {len(x)}"
     demand(J.shape == (len(value), len(x)), f"{name}.jacobian", rule, str(J.shape))
     # Differences over two steps, of which the error is of the fourth power of the step.

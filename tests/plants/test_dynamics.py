@@ -517,6 +517,11 @@ class WrongSlope(Pendulum):
         return np.array([[1.0, 0.1], [-0.1, 1.0]])
 
 
+class NoSlope(Pendulum):
+    def jacobian(self, x, u, t):
+        return np.array([[1.0, 0.1], [math.nan, 1.0]])
+
+
 class Forgetful(Pendulum):
     def __init__(self):
         self.calls = 0
@@ -535,6 +540,7 @@ def test_check_plant_holds_f_to_its_word():
     netkf.testing.check_plant(plant(Pendulum()))
     for cls, words in (
         (WrongSlope, "WrongSlope.jacobian: must be the derivatives of f; got entry [1, 0] off by"),
+        (NoSlope, "NoSlope.jacobian: must be finite"),
         (Forgetful, "Forgetful.f: must be the same for equal x, u and t"),
     ):
         with pytest.raises(AssertionError) as caught:

@@ -43,6 +43,14 @@ def test_a_single_run_exceeds_no_bound(mean, side):
     assert f"P was {side} it" in _sentence([(mean, None, 1.0)], runs=1)
 
 
+@pytest.mark.parametrize(("reason", "named"), [("clocks have no rate", 0), ("below H(12)", 1)])
+def test_a_paper_is_named_where_its_equations_are(reason, named):
+    node = {"bound": None, "mean_trace": 1.0}
+    source = SimpleNamespace(summary={"nodes": [node], "bound": reason}, runs=1)
+    (text,) = claims._describe_bound(source)
+    assert text.count("H is the paper") == named
+
+
 def test_unknown_consistency_is_no_inconsistency():
     def row(name, consistency):
         rms = SimpleNamespace(value=1.0, real=False)
