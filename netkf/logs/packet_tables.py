@@ -89,6 +89,10 @@ def read_tables(log: Path, columns: Mapping[str, str]) -> PacketLog:
     is_run = (log / "scenario.toml").is_file()
     origin = Decimal(0) if is_run else choose_origin(rows.stamps, resolution)
     table = rows.table.assign(t=[float(stamp - origin) for stamp in rows.stamps])
+    falls = -np.minimum(np.diff(table["t"]), 0.0)
+    if falls.any():
+        count = count_phrase(int(np.count_nonzero(falls)), "time")
+        notes.append(f"sorted: stamps fall from row to row {count}, by up to {falls.max():g} s")
     delays = [
         np.nan if b is None else float(b - a)
         for a, b in zip(rows.stamps, rows.arrivals, strict=True)
@@ -303,7 +307,7 @@ def _match(
     if _counts_directions(table):
         table["to"] = table["receiver"]
         notes.append("used: each row is a message of its own to one receiver, no broadcast")
-    table["key"] = _number_transmissions(table, notes)
+    table["key"] = _number_transmissions(table, notes, log)
     # Of one transmission the sender's own stamp counts, else the first one.
     table["order"] = (table["what"] != "tx").astype(int)
     ordered = table.sort_values(["order", "t"], kind="stable")
@@ -339,8 +343,10 @@ def _counts_directions(table: pd.DataFrame) -> bool:
     return bool(many and not table.duplicated(["sender", "t"]).any())
 
 
-def _number_transmissions(table: pd.DataFrame, notes: list[str]) -> pd.Series:
-    """Return a key of the transmission of each row, and add its ``counter`` to the table."""
+def _number_transmissions(table: pd.DataFrame, notes: list[str], log: str) -> pd.Series:
+    """Return a key of the transmission of each row, and add its ``counter`` to the table; raises
+    ScenarioError where numbers make no sense.
+    """
     keys = pd.Series(index=table.index, dtype=object)
     table["counter"] = 0
     wraps = restarts = missing = 0
@@ -351,6 +357,12 @@ def _number_transmissions(table: pd.DataFrame, notes: list[str]) -> pd.Series:
         known = own[own["number"].notna()]
         missing += len(own) - len(known)
         found = unwrap(known["number"].to_numpy().astype(np.int64), known["t"].to_numpy())
+        if found[3] > max(3, len(np.unique(found[0])) // 10):
+            rule = f"numbers of {sender} begin again {found[3]} times: stamps do not fit each other"
+            remedy = (
+                "correct those of clocks that began again, or that are a cycle of numbers apart"
+            )
+            raise ScenarioError(log, rule, None, remedy)
         wraps, restarts = wraps + found[1], restarts + found[3]
         moduli |= {found[2]} if found[1] else set()
         table.loc[known.index, "counter"] = found[0]
@@ -480,7 +492,11 @@ def _merge_rows(rows: pd.DataFrame, notes: list[str], log: str) -> pd.DataFrame:
         rule = f"{lines}: one says heard and one says lost"
         raise ScenarioError(log, rule, [str(two["sender"].iloc[0]), receiver], "correct a row")
     if repeated:
-        notes.append(f"merged: {count_phrase(repeated, 'row')} that repeat an outcome")
+        # Far apart they are hardly one: a clock that began again.
+        t = rows.groupby(key)["t"]
+        apart = (t.max() - t.min()).max()
+        told = f", up to {apart:g} s apart" if apart else ""
+        notes.append(f"merged: {count_phrase(repeated, 'row')} that repeat an outcome{told}")
     ordered = rows.sort_values(["send", "heard", "delay"], kind="stable", na_position="last")
     columns = ["send", "receiver", "heard", "delay", "rssi"]
     return ordered.drop_duplicates(key)[columns].reset_index(drop=True)

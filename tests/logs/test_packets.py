@@ -268,6 +268,25 @@ def test_a_node_that_logs_what_was_sent_to_an_address_heard_it(tmp_path):
     assert (len(run.nodes), run.count("deliver"), run.count("lost")) == (3, 60, 20)
 
 
+def test_a_clock_that_begins_again_is_told(tmp_path):
+    """Node 2 boots at packet 100 and counts its seconds from 0 on, its numbers too in one log."""
+    for name, first in (("numbers", 100), ("clock", 0)):
+        rows = ["t,node,src,dst,seq"]
+        for k in range(200):
+            late, number = 100.0 * (k >= 100), k - first * (k >= 100)
+            rows += [f"{k},1,1,,{k}", f"{k - late},2,1,,{k}"]
+            rows += [f"{k + 0.5 - late},2,2,,{number}", f"{k + 0.5},1,2,,{number}"]
+        log = write(tmp_path / f"{name}.csv", rows)
+        with pytest.raises(
+            ScenarioError, match=r"numbers of 1 begin again \d+ times: stamps do not"
+        ):
+            netkf.import_log(log, "csv", tmp_path / "out")
+    rows = ["t,src,dst,seq", "5,1,2,0", "6,1,2,1", "4.9,1,2,0"]
+    _, notes = netkf.import_log(write(tmp_path / "log.csv", rows), "csv", tmp_path / "out")
+    assert "sorted: stamps fall from row to row 1 time, by up to 1.1 s" in notes
+    assert "merged: 1 row that repeat an outcome, up to 0.1 s apart" in notes
+
+
 def test_counters_begin_again():
     numbers = np.array([*range(40, 70), *range(30), *range(5)])
     counters, wraps, _, restarts = unwrap(numbers, np.arange(len(numbers), dtype=float))
