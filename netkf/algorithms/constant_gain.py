@@ -227,7 +227,9 @@ class ConstantGain(Filter):
         nodes, n = scenario.nodes, scenario.plant.n
         if isinstance(self.gain, tuple) and len(self.gain) != len(nodes):
             rule = f"must be one matrix, or one for each of {len(nodes)} nodes"
-            raise ScenarioError("filter.gain", rule, f"{len(self.gain)} matrices", "add or remove")
+            raise ScenarioError(
+                "filter.gain", rule, f"{len(self.gain)} matrices", "add or remove some"
+            )
         for index, node in enumerate(nodes):
             placed = scenario.placed_sensors.get(node, ())
             kinds = [getattr(scenario.sensors[one.entry], "sampling", None) for one in placed]

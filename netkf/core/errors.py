@@ -110,6 +110,8 @@ def quote(value: object, max_length: int = 80) -> str:
     """Return ``repr(value)`` on one line, arrays as lists, shortened in the middle to
     ``max_length`` characters if it is longer.
     """
+    if isinstance(value, list | tuple) and not hasattr(value, "_fields"):
+        value = type(value)(getattr(one, "tolist", lambda one=one: one)() for one in value)
     tolist = getattr(value, "tolist", None)
     try:
         text = " ".join(repr(tolist() if callable(tolist) else value).split())

@@ -191,9 +191,11 @@ def _places(blocks: Sequence[Block]) -> Iterator[Place]:
             raise ScenarioError(f"[{k}].name", rule, block.name, "give the block another name")
         for node in block.nodes or (None,):
             if (block.name, node) in seen:
-                j = names.index(block.name)
-                rule = f"must not own two blocks {quote(block.name)}, see also [{j}]"
-                raise ScenarioError(f"[{k}].nodes", rule, node, "give one of them another name")
+                remedy = (
+                    f"name it once, or give the block another name than [{names.index(block.name)}]"
+                )
+                rule = f"must not own two blocks {quote(block.name)}"
+                raise ScenarioError(f"[{k}].nodes", rule, node, remedy)
             seen.add((block.name, node))
             yield Place(block.name, node, first, block.plant.n)
             first += block.plant.n

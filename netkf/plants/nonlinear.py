@@ -381,10 +381,10 @@ class PositionedSensor(NonlinearSensor):
             which = f"anchor in {self.record.path.name}: {', '.join(map(str, places))}"
         if not isinstance(self.positions, str) and shape != (len(places), len(self.states)):
             rule = f"must be {len(places)} rows of {len(self.states)}, one for each {which}"
-            raise ScenarioError("positions", rule, f"{shape[0]} x {shape[1]}", "add or remove")
+            raise ScenarioError("positions", rule, f"{shape[0]} x {shape[1]}", "add or remove some")
         if self.R.shape != (self.rows, self.rows):
             rule = f"must be {self.rows} x {self.rows}"
-            raise ScenarioError("R", rule, "{} x {}".format(*self.R.shape), "add or remove")
+            raise ScenarioError("R", rule, self.R, "correct the shape")
 
     def support(self, n: int, node: int) -> np.ndarray:
         """Return the entries (k,) of the state that readings depend on: position and heading."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError, errors_under, suggest_nearest
 from netkf.core.places import Place
+from netkf.core.printable import list_some
 from netkf.network.graphs import Topology
 from netkf.plants.blocks import Layout
 from netkf.plants.nonlinear import PositionedSensor
@@ -61,6 +62,27 @@ def support_of(sensor: Any, n: int) -> np.ndarray:
     if not matrices or (sensor.record is not None and sensor.record.regressors):
         return np.arange(n)
     return np.flatnonzero(np.concatenate(matrices).any(axis=0))
+
+
+def unheard_notes(scenario: Any) -> tuple[str, ...]:
+    """Return a line for each sensor of pairs with readings that nobody uses: neither the reader nor
+    who hears it estimates the other block.
+    """
+    needs, notes = scenario.node_filter.needs, []
+    if scenario.node_filter.timing.pooled or needs.coupled or not scenario.plants:
+        return ()
+    topology, estimated = scenario.topology, scenario.estimated
+    for k, sensor in enumerate(scenario.declared_sensors):
+        pairs = _pairs(sensor, scenario.layout, topology) if isinstance(sensor, RELATIVE) else ()
+        unheard = []
+        for own, other in pairs:
+            users = own.node, *topology.receivers(own.node)
+            if not any(other in estimated[topology.index[node]] for node in users):
+                unheard.append(f"node {own.node} of {other.node}")
+        if unheard:
+            rule = "nobody who hears the reader estimates the block of the other"
+            notes.append(f"sensors[{k}]: readings by {list_some(unheard, 3)} are not used: {rule}")
+    return tuple(notes)
 
 
 CHOICES = ("all", "own", "own+neighbours", "shared")

@@ -10,6 +10,7 @@ from typing import Any
 
 from netkf.algorithms.kernels.maps import METHODS
 from netkf.core.errors import NetkfError, ScenarioError
+from netkf.scenario.block_sensors import unheard_notes
 from netkf.scenario.checks import check_scenario
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.plugins import explain_user_error
@@ -90,6 +91,7 @@ class Scenario(DerivedScenario):
             *repeat_notes(self),
             *record_notes(self),
             *sampling_notes(self),
+            *unheard_notes(self),
             *stamp_notes(self),
             *grid_notes(self),
             *self._share_notes,

@@ -290,6 +290,28 @@ def test_heading_of_a_sensor_of_places(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("keys", "unused"),
+    [
+        ({"kind": "block-intersection"}, "node 1 of 3, node 3 of 1"),
+        ({"kind": "block-belief-propagation"}, "node 1 of 3, node 3 of 1"),
+        ({"kind": "block-intersection", "estimates": "all"}, ""),
+        ({"kind": "partition"}, ""),
+        ({"kind": "central"}, ""),
+    ],
+)
+def test_readings_of_pairs_that_reach_nobody_are_noted(
+    tmp_path: Path, keys: dict[str, object], unused: str
+) -> None:
+    pairs = 'kind = "relative"\nto = [[1, 3], [1, 2], [3, 1]]'
+    text = ROBOTS.replace('kind = "relative"', pairs)
+    filtering = {"estimates": "own"} | keys
+    changes = {"filter": filtering, "network.activation": {"kind": "readings"}}
+    notes = load(text, tmp_path).replace(changes).notes
+    line = f"sensors[1]: readings by {unused} are not used: nobody who hears the reader"
+    assert any(note.startswith(line) for note in notes) == bool(unused)
+
+
+@pytest.mark.parametrize(
     ("old", "new", "key", "rule"),
     [
         ('of = "pose"\nH', 'of = "prose"\nH', "sensors[0].of", "must be the name of one of"),
@@ -297,6 +319,12 @@ def test_heading_of_a_sensor_of_places(tmp_path: Path) -> None:
         ("nodes = [1, 2, 3]", "nodes = [1, 2]", "sensors[1].to", None),
         ("nodes = [1, 2, 3]", "nodes = [1, 2, 4]", "plants[0].nodes[2]", "node of the graph"),
         ("nodes = [1, 2, 3]", "nodes = [1, 2, 2]", "plants[0].nodes", "two blocks"),
+        (
+            "cov =",
+            "means = [[1.0], [2.0]]\ncov =",
+            "plants[0].means",
+            "got [[1.0], [2.0]]; correct",
+        ),
         ("A = [[0.0]]", "A = [[0.0]]\nF = [[1.0]]", "plants[0].A", "not a key"),
         ("B = [[0.5]]", "B = [[0.5], [1.0]]", "plants[0].B", "1 x 1"),
         ("cov =", "coupling = [{ from = 'x', A = [[1.0]] }]\ncov =", "plants[0].coupling[0].f", ""),
