@@ -18,8 +18,11 @@ import numpy as np
 
 from netkf.algorithms.kernels import run as standard
 from netkf.algorithms.kernels.neighbours import combine_convex
+from netkf.core.errors import quote
 from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.linalg.compiling import Kernel
 from netkf.linalg.lanes import aligned
+from netkf.linalg.plain import is_plain
 from netkf.linalg.structs import Struct, StructClass
 
 Shapes = Mapping[str, Any]
@@ -56,6 +59,24 @@ class Record:
     scratch: Shapes = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        """Raise TypeError for what is no shape, by which memory would be shared out."""
+        for table in ("node", "past", "link", "payload", "scratch"):
+            for name, shape in getattr(self, table).items():
+                if not _is_shape(shape):
+                    rule = "must be a tuple of whole numbers of at least 0"
+                    raise TypeError(f"Record.{table}[{name!r}] {rule}, not {quote(shape)}")
+        for name, value in self.settings.items():
+            if value is None or isinstance(value, str):
+                raise TypeError(f"Record.settings[{name!r}] must be a number, not {quote(value)}")
+
+
+def _is_shape(shape: Any) -> bool:
+    if isinstance(shape, tuple) and len(shape) == 2 and isinstance(shape[0], tuple):
+        shape = shape[0]  # the other one is the dtype
+    counts = (int, np.integer)
+    return isinstance(shape, tuple) and all(isinstance(k, counts) and k >= 0 for k in shape)
+
 
 def triangle_numbers(n: int, *count: int) -> IntArray:
     """Return the numbers of a lower triangular matrix (n, n), or of ``count`` roots (n, n + 1) of
@@ -91,6 +112,9 @@ def begin_estimate(_filtering: Any, _node: Any, _info: Any, _model: Any) -> None
 
 def prepare_nothing(_filtering: Any, _record: Any, *_: Any) -> None:
     """Set nothing: the record does not depend on the slots."""
+
+
+VERBS = ("predict", "update", "emit", "absorb", "shift", "shift_payload", "observe", "interval")
 
 
 @dataclass(frozen=True)
@@ -148,6 +172,21 @@ class Kernels:
     under_clocks: Kernels | None = None
     means: tuple[str, ...] = ("xhat",)
     depends_on_data: bool | None = None
+
+    def __post_init__(self) -> None:
+        """Raise TypeError for a verb that is no kernel."""
+        for name in VERBS:
+            verb = getattr(self, name)
+            if not (isinstance(verb, Kernel) or (is_plain() and callable(verb))):
+                rule = "must be a kernel (netkf.kernels.kernel)"
+                raise TypeError(f"Kernels.{name} {rule}, not {quote(verb)}")
+
+    def record_of(self, filtering: Any, infos: Sequence[Any], models: Sequence[Any]) -> Record:
+        """Return what ``record`` makes; raises TypeError if it is no Record."""
+        record: Any = self.record(filtering, infos, models)
+        if not isinstance(record, Record):
+            raise TypeError(f"Kernels.record must return a Record, not {quote(record)}")
+        return record
 
     @property
     def affine(self) -> bool:
@@ -272,7 +311,7 @@ def make_records(
     """
     n, count = len(starts[0][0]), len(starts)
     kernels = filtering.kernels
-    record: Record = kernels.record(filtering, infos, models)
+    record = kernels.record_of(filtering, infos, models)
     known = {**estimate_shapes(n), **record.node}
     if record.past:
         known["kept"] = ((), np.int64)

@@ -140,7 +140,7 @@ def _translates(scenario: DerivedScenario) -> bool:
         state = algorithm.init(model, *start, info)
         payload = algorithm.emit(state, Exchange(0.0, 0, 0, 0, tuple(info.senders)))[1]
         return isinstance(payload, np.ndarray) and payload.shape == start[0].shape
-    shapes = kernels.record(algorithm, [info], [model]).payload.values()
+    shapes = kernels.record_of(algorithm, [info], [model]).payload.values()
     kernels = kernels.of(not scenario.slotted)
     says_more = kernels.sends_readings or kernels.addressed
     return not says_more and list(shapes) == [start[0].shape]

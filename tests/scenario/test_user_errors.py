@@ -16,6 +16,7 @@ import pytest
 import netkf
 from netkf import parts
 from netkf.cli.main import main
+from netkf.kernels import Kernels, Record
 from netkf.testing import check_channel, check_clock, check_filter, check_sensor
 
 HEAD = "from dataclasses import dataclass\nimport numpy as np\nfrom netkf.parts import *\n"
@@ -297,6 +298,31 @@ class Bigamy(parts.Matching):
 
     def draw(self, topology, random):
         return [(0, 1), (1, 2)]
+
+
+RECORDS = {
+    "nothing": None,
+    "x": {"node": {"a": "x"}},
+    "-2": {"payload": {"a": (-2,)}},
+    "abc": {"settings": {"a": "abc"}},
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Misshapen(parts.Filter):
+    what: str = parts.setting(parts.text)
+
+    kernels = Kernels(lambda own, *_: RECORDS[own.what] and Record(**RECORDS[own.what]))
+
+
+@pytest.mark.parametrize("what", RECORDS)
+def test_what_is_no_record_or_kernel_is_told(what, ring):
+    words = rf"Misshapen failed.*TypeError: (Kernels.record must return a Record|Record\.\w+\['a'\] must be.*{what})"
+    for engine in ("simpy", "compiled"):
+        with pytest.raises(netkf.EngineError, match=words):
+            netkf.simulate(ring.replace({"filter": Misshapen(what)}), engine=engine)
+    with pytest.raises(TypeError, match=r"Kernels\.absorb must be a kernel .*, not 3"):
+        Kernels(absorb=3)
 
 
 @pytest.mark.parametrize("engine", ["simpy", "compiled"])

@@ -119,7 +119,7 @@ def _record_of(scenario: Scenario) -> Record:
     kernels, infos = scenario.node_filter.kernels, scenario.node_infos
     assert kernels is not None
     # That of the filter, also where it has other verbs under clocks.
-    return kernels.record(scenario.node_filter, infos, scenario.model_pieces[0])
+    return kernels.record_of(scenario.node_filter, infos, scenario.model_pieces[0])
 
 
 def together(nodes: int, runs: int) -> int:

@@ -110,7 +110,7 @@ def unquantised_messages(scenario: Scenario) -> str | None:
     if kernels.addressed:
         return "messages of few bits that differ from hearer to hearer"
     infos, models = scenario.node_infos, scenario.model_pieces[0]
-    record = kernels.record(scenario.node_filter, infos, models)
+    record = kernels.record_of(scenario.node_filter, infos, models)
     for name, given in record.payload.items():
         is_square = len(given) == 2 and given[0] == given[1]
         if is_square and name not in record.numbers and name != "root":
