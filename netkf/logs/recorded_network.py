@@ -88,7 +88,7 @@ def write_network(
         _begin_with(like, log)
     outcomes = settle(log, hole, unreported)
     if outcomes.empty:
-        rule = "must name senders, and who heard them: one receiver a row"
+        rule = "must have packets that somebody heard: a sender and one receiver a row"
         raise ScenarioError(name, rule, None, "name its column: --columns receiver=COLUMN")
     account = accounts(log.sends, outcomes)
     if like is not None and like.network.lives:
@@ -310,6 +310,11 @@ def _scenario_like(
         log.notes.append(
             f"used: nodes send when the scenario says ({network['activation']['kind']}); outcomes "
             "are those of the log, message by message"
+        )
+    if scenario.network.lives and not log.is_run:
+        log.notes.append(
+            "used: a node that is down does not send what it sent in the log; its later messages "
+            "have the fates of earlier ones, number by number"
         )
     for source in source_files(scenario):
         if source not in replaced:

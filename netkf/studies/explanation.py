@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from netkf.core.printable import shorten
+from netkf.core.printable import count_phrase, shorten
 from netkf.network.deliveries import MessageKey
 from netkf.runs.files import to_json_value
 from netkf.runs.outcomes import Downtime
@@ -229,7 +229,7 @@ class Why:
             subject = "It was itself" if one.node == self.node else f"Node {one.node} was"
             yield f"{subject} down {since if one.kind else 'since the beginning'}."
         if len(self.down) > MAX_LISTED:
-            yield f"{len(self.down) - MAX_LISTED} other nodes were down too."
+            yield f"Down too: {count_phrase(len(self.down) - MAX_LISTED, 'other node')}."
 
     def _heard_sentences(self) -> Iterator[str]:
         neighbours = [s for s in self.sources if s.neighbour]
@@ -240,9 +240,8 @@ class Why:
         silent = [s.node for s in neighbours if math.isnan(s.heard)]
         parts = [f"node {s.node} {self._format_time_before(s.heard)}" for s in heard[:MAX_LISTED]]
         if parts:
-            others = (
-                f" and {len(heard) - MAX_LISTED} others before" if len(heard) > MAX_LISTED else ""
-            )
+            more = len(heard) - MAX_LISTED
+            others = f" and {count_phrase(more, 'other')} before" if more > 0 else ""
             yield f"It last heard {_join_with_and(parts)}{others} (times of sending)."
         if silent:
             yield f"It had never heard node {_list_items(silent)}."
@@ -251,7 +250,7 @@ class Why:
             counts = [f"{s.unheard} of node {s.node}" for s in neighbours if s.unheard]
             verb = "message sent to it since then was"
             verb = verb if unheard == 1 else "messages sent to it since then were"
-            listed = _list_items(counts, "other nodes")
+            listed = _list_items(counts, "other node")
             yield f"{unheard} {verb} lost, late or not used: {listed}."
 
     def _reading_sentences(self) -> Iterator[str]:
@@ -282,10 +281,8 @@ class Why:
             age = f"{self.at - newest:.4g} s old"
             yield f"A newer reading of node {source.node}, {age}, would have come with {messages}."
         if len(kept_from_newer) > MAX_LISTED:
-            others = len(kept_from_newer) - MAX_LISTED
-            yield (
-                f"Newer readings of {others} other nodes would have come too, with these or others."
-            )
+            others = count_phrase(len(kept_from_newer) - MAX_LISTED, "other node")
+            yield f"Newer readings of {others} would have come too, with these or others."
         if sensors and not kept_from_newer:
             count = len(sensors[0].with_more)
             messages = "one message" if count == 1 else f"up to {COUNT_WORDS[count]} messages"
@@ -352,7 +349,9 @@ class Why:
             for s in listed
         ]
         text = format_table(header, shorten_rows(rows, MAX_ROWS), left_columns=1)
-        other_text = f"\n{others} other nodes have no sensor and no link to it." if others else ""
+        other_text = (
+            f"\nwithout a sensor and a link to it: {count_phrase(others, 'node')}" if others else ""
+        )
         ages = f"+1 .. +{budget}: age of the newest reading with so many more messages"
         return f"{text}\ntimes in seconds; {ages}{other_text}"
 
@@ -416,11 +415,11 @@ def _format_route(source: InformationSource) -> str:
     return " -> ".join(map(str, nodes))
 
 
-def _list_items(items: Sequence[object], others: str = "others") -> str:
-    """Return the first MAX_LISTED items joined, and the number of the ``others``."""
+def _list_items(items: Sequence[object], other: str = "other") -> str:
+    """Return the first MAX_LISTED items joined, and the number of each ``other``."""
     parts = [str(item) for item in items[:MAX_LISTED]]
     more = len(items) - len(parts)
-    return _join_with_and([*parts, f"{more} {others}"] if more else parts)
+    return _join_with_and([*parts, count_phrase(more, other)] if more else parts)
 
 
 def _join_with_and(parts: Sequence[str]) -> str:

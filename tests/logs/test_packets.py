@@ -10,6 +10,7 @@ import netkf
 from netkf.cli.main import main
 from netkf.core.errors import ScenarioError
 from netkf.logs.packets import unwrap
+from netkf.scenario.writing import as_table, to_toml
 from tests.conftest import SCENARIOS
 
 MERCATOR = """\
@@ -162,7 +163,7 @@ def test_outcomes_events_and_repeated_rows(tmp_path, capsys):
         (["t,src,dst,seq", "1,1,2,1.5"], r"line 2: number must be an integer"),
         (["t,src,dst,seq", "1,1,2,x"], r"line 2: seq must be a number"),
         (["t,src,dst,seq", f"1,1,2,{2**60}"], r"line 2: number must be an integer from 0 to 2\^53"),
-        (["t,src,1,2", "1,1,1,0"], r"must name senders, and who heard them: one receiver a row"),
+        (["t,src,1,2", "1,1,1,0"], r"must have packets that somebody heard"),
         (["t,src,dst,ok", "1,1,2,maybe"], r"line 2: ok must say 1 or 0"),
         (["t,dst", "1,2"], r"must have a column sender"),
         (["t,src,dst", "1,2,2"], r"line 2: sender and receiver must differ"),
@@ -503,6 +504,11 @@ def test_a_log_may_take_the_plant_of_a_scenario(tmp_path):
     scenario = netkf.load(out / "scenario.toml")
     assert scenario.plant.n == 2
     assert scenario.network.activation.at == "nodes"
+    # What nodes that are down do not send shifts what becomes of the rest.
+    lives = {"network.lives": [{"kind": "duty", "nodes": [1], "period": 4.0, "up": 2.0}]}
+    (tmp_path / "run" / "down.toml").write_text(to_toml(as_table(netkf.load(like, lives))))
+    _, notes = netkf.import_log(log, "csv", tmp_path / "b", like=tmp_path / "run" / "down.toml")
+    assert any("a node that is down does not send what it sent" in note for note in notes)
 
 
 def test_the_origin_and_decimals_of_stamps_are_kept(tmp_path):

@@ -475,6 +475,15 @@ def test_messages_of_the_slot_of_a_filtered_sample_are_not_of_its_future(build):
     assert (found.table.known_age.dropna() >= 0.0).all()
 
 
+@pytest.mark.parametrize(("nodes", "told"), [(6, "and 1 other before"), (7, "and 2 others before")])
+def test_who_is_not_named_is_counted(build, nodes, told):
+    clock = {"kind": "periodic", "at": "nodes", "period": 0.3, "phase": "random"}
+    network = {"graph": {"kind": "complete", "nodes": nodes}, "activation": clock}
+    sensors = [{"nodes": [0], "H": [[1.0]], "R": [[0.5]]}]
+    scenario = build(network=network, sensors=sensors, filter={"kind": "diffusion"})
+    assert told in str(why(netkf.simulate(scenario), 1, 2.0))
+
+
 @pytest.mark.parametrize(("kind", "known"), [("local", {1}), ("central", {0, 1})])
 def test_filters_that_do_not_talk_have_no_missing_messages(build, kind, known):
     sensors = [{"nodes": [0, 1], "H": [[1.0]], "R": [[0.5]]}]
