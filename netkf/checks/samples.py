@@ -68,9 +68,9 @@ class RunSamples:
         P = np.zeros((len(self.scenario.nodes), self.scenario.width, self.scenario.width))
         for k, node in enumerate(self.scenario.nodes):
             cov = self.scenario.initial_estimate(node)[1]
-            view = self.scenario.view(k) if len(cov) > self.scenario.width else slice(None)
-            own = cov[view][:, view]
-            P[k, : len(own), : len(own)] = own
+            pooled, n = self.scenario.node_filter.timing.pooled, self.scenario.sizes[k]
+            view = self.scenario.view(k) if pooled else slice(n)
+            P[k, :n, :n] = cov[view][:, view]
         return P
 
     @property

@@ -255,6 +255,13 @@ class DerivedScenario(ScenarioModel):
         whole = np.arange(self.plant.n)
         return tuple(np.append(view, np.setdiff1d(whole, view)) for view in views)
 
+    def model_view(self, k: int) -> Any:
+        """Return the entries (n,) of the state of which filter number ``k`` has a model, or a
+        slice.
+        """
+        views = None if self.node_filter.timing.pooled else self.model_views
+        return slice(None) if views is None else views[k]
+
     @property
     def model_width(self) -> int:
         """The largest number of states of which a node has a model."""
@@ -808,10 +815,9 @@ class DerivedScenario(ScenarioModel):
             cov = self.plant.start_cov
         xhat = mean[index] if isinstance(mean, tuple) else mean
         P = cov[index] if isinstance(cov, tuple) else cov
-        if self.model_views is None or self.node_filter.timing.pooled:
-            return xhat, P
-        view = self.model_views[index]
-        return xhat[view], P[np.ix_(view, view)]
+        view = self.model_view(index)
+        # Without views all nodes share one object.
+        return (xhat, P) if isinstance(view, slice) else (xhat[view], P[np.ix_(view, view)])
 
     def fresh_estimate(self, node: int, when: float) -> tuple[FloatArray, FloatArray]:
         """Return ``initial_estimate`` of a node that begins again ``when`` (s or slot)."""

@@ -257,6 +257,14 @@ def test_P_is_never_below_the_covariance_of_the_error(
         assert np.trace(run.P[-1, k, :n, :n]) < 4.0 * np.trace(exact[-1, k, :n, :n])
 
 
+@pytest.mark.parametrize("text", [AREAS, clocked(AREAS)], ids=["slots", "clocks"])
+def test_theory_takes_states_in_the_order_of_each_node(tmp_path: Path, text: str) -> None:
+    """A node keeps its own blocks first: means and covariances of the start must follow."""
+    mean = text.replace("cov = [[1.5]]", "cov = [[1.5]]\nmean = [7.0]")
+    rows = netkf.theory.assumptions(load(mean, tmp_path))
+    assert rows[rows["assumption"].str.startswith("P_i(0)")]["holds"].tolist() == [True]
+
+
 def test_a_reading_across_a_border_is_used_by_covariance_intersection(tmp_path: Path) -> None:
     text = AREAS.replace("[network]", FLOWS, 1)
     horizon = {"horizon": 1.0}

@@ -80,7 +80,7 @@ def start_rows(scenario: Scenario, source: str) -> list[AssumptionRow]:
     # Most networks have one start for all nodes.
     for mean, cov, k in {(id(start[0]), id(start[1])): start for start in starts}.values():
         # E[(x - xhat)(x - xhat)'] = cov of x(0) + the square of the difference of the means
-        view = scenario.view(k) if len(mean) < plant.n else slice(None)
+        view = scenario.model_view(k)
         offset = plant.start_mean[view] - mean
         gap = cov - plant.start_cov[view][:, view] - np.outer(offset, offset)
         smallest = min(smallest, float(np.linalg.eigvalsh(gap)[0]) / max(1.0, np.abs(cov).max()))
