@@ -335,11 +335,11 @@ def _in_holes(log: PacketLog, whole: pd.DataFrame, hole: float) -> np.ndarray:
         signs = own["t"][~own["missing"]].tolist()
         signs += logged["t"][logged["sender"] == receiver].tolist()
         missing = own[own["missing"] & (own["usual"] >= USUAL)]
-        stretch = np.searchsorted(np.sort(signs), missing["t"], side="right")
+        stretches = missing.groupby(np.searchsorted(np.sort(signs), missing["t"], side="right"))
+        is_long = (stretches["usual"].sum() >= hole) & (stretches["sender"].nunique() >= 2)
         others = np.sort(reported["t"][reported["receiver"] != receiver])
-        for _, part in missing.groupby(stretch):
-            if part["usual"].sum() < hole or part["sender"].nunique() < 2:
-                continue
+        for k in is_long.index[is_long]:
+            part = stretches.get_group(k)
             low, high = float(part["t"].min()), float(part["t"].max())
             if np.diff(np.searchsorted(others, [low, high]))[0] == 0:
                 continue  # nobody hears anything: that is the network
