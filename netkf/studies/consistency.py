@@ -9,7 +9,6 @@ and less for those that are conservative by design, which are then not called in
 from __future__ import annotations
 
 import bisect
-import contextlib
 import dataclasses
 import math
 from collections.abc import Iterator, Sequence
@@ -42,6 +41,7 @@ from netkf.studies.innovations import (
     nis_of,
     readings_of_block,
 )
+from netkf.theory.common.evidence import CONSISTENCY
 from netkf.theory.errors import error_squares
 from netkf.trace.nees import errors
 from netkf.trace.run import Run, blurred_samples
@@ -86,6 +86,7 @@ class RunConsistency(NamedTuple):
     nis, expected_nis : (K,) means over time of NIS and of its expected value, nan if unknown
     blurred_from : (1,) first time (s) at which an error is left out, inf without one
     covariance_given : (1,) True if the filter gives a covariance
+    reason       : (1,) text, why the expected values are unknown
     """
 
     samples: FloatArray
@@ -95,6 +96,7 @@ class RunConsistency(NamedTuple):
     expected_nis: FloatArray
     blurred_from: FloatArray
     covariance_given: np.ndarray
+    reason: np.ndarray
 
 
 # Errors of a filter that is unstable grow until their squares overflow: the verdicts say so.
@@ -112,12 +114,14 @@ def run_consistency(
         scenario = dataclasses.replace(scenario, probe=innovations.times)
         run = innovations.run = simulate(scenario, seed, replica, engine)
     after_start = np.flatnonzero((run.times > 0.0) & np.isin(run.times, shown))
-    sigma = None  # (T, N, n, n), E[e e'] given the events; None if unknown or too large
+    sigma, why = None, ""  # (T, N, n, n), E[e e'] given the events; None if unknown or too large
     if _count_errors(scenario) <= MAX_ERRORS:
-        with contextlib.suppress(TheoryError):
+        try:
             sigma = error_squares(scenario, run)
             # Others follow what is recorded too, of which this is an average over a law.
             sigma[:, ~nodes_with_law(scenario)] = np.nan
+        except TheoryError as error:
+            why = str(error).removesuffix(f"; {CONSISTENCY}")
     columns = [_block_consistency(run, sigma, block) for block in blocks]
     nees, expected, blurred = (np.stack(column, axis=1) for column in zip(*columns, strict=True))
     if innovations is not None:
@@ -134,6 +138,7 @@ def run_consistency(
         expected_nis=expected_nis,
         blurred_from=times[:1] if len(times) else np.full(1, np.inf),
         covariance_given=np.array([np.isfinite(run.P).any()]),
+        reason=np.array([why]),
     )
 
 
@@ -414,6 +419,8 @@ def judge_consistency(
             f"errors, more than {MAX_ERRORS}, takes long; netkf.theory.error_covariance computes it"
         )
         notes = (*notes, reason)
+    if why := runs[0].reason[0]:
+        notes = (*notes, f"the expected NEES is unknown: {why}")
     if unjudged := unjudged_line(scenario):
         notes = (*notes, f"not judged: {unjudged}, so that errors have no known law")
     if np.isfinite(blurred_from):

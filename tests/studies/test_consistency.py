@@ -26,6 +26,7 @@ from tests.algorithms.test_block_intersection import CLOCKED, ROBOTS, load
 from tests.checks.broken import Overconfident
 from tests.conftest import SCENARIOS
 
+NO_REASON = np.array([""])
 GOSSIP = str(SCENARIOS / "gossip_ring.toml")
 
 
@@ -120,6 +121,7 @@ def test_what_is_not_known_is_not_judged(gossip):
     for row in found.rows:
         assert row.verdict == "above n; the expected NEES is unknown"
         assert row.nees == pytest.approx(16.0, rel=0.3)
+    assert "the expected NEES is unknown: the exact error covariance is not known" in found.notes[0]
 
 
 def test_exact_covariances_of_large_networks_are_left_out_and_a_line_says_so(ring):
@@ -158,7 +160,7 @@ def test_errors_that_are_not_what_they_should_be_are_found(gossip, factor, words
         samples = factor * random.chisquare(n, size=(10, nodes))
         nothing = np.full(nodes, np.nan)
         told = samples.mean(axis=0), np.full(nodes, 4.0), nothing, nothing
-        runs.append(RunConsistency(samples, *told, np.array([np.inf]), np.array([True])))
+        runs.append(RunConsistency(samples, *told, np.array([np.inf]), np.array([True]), NO_REASON))
     found = judge_consistency(gossip, runs, 0.999)
     assert bool(found) == (factor == 1.0)
     assert all(words in row.verdict for row in found.rows)
@@ -174,7 +176,7 @@ def test_a_broken_node_is_named_with_its_time(gossip):
         samples[9:, 2] *= 2.0  # from 10 s on
         nothing = np.full(nodes, np.nan)
         told = samples.mean(axis=0), np.full(nodes, 4.0), nothing, nothing
-        runs.append(RunConsistency(samples, *told, np.array([np.inf]), np.array([True])))
+        runs.append(RunConsistency(samples, *told, np.array([np.inf]), np.array([True]), NO_REASON))
     verdicts = [row.verdict for row in judge_consistency(gossip, runs, 0.999).rows]
     assert verdicts.pop(2) == "BROKEN: errors are larger than expected, since 10 s"
     assert set(verdicts) == {"consistent"}

@@ -242,7 +242,7 @@ def left_weights(scenario: Scenario) -> FloatArray:
             f"the {kind_name(algorithm)} filter does not talk, links mean nothing to it"
         )
     if has_balanced_rates(scenario) is None:
-        raise TheoryError("how often messages arrive is not known beforehand (a recorded table?)")
+        raise TheoryError("how often messages arrive is not known beforehand")
     # The coupling has the left null vector w of its Laplacian D - C: w_j = share of node j's
     # information in the common estimate.
     c = coupling(scenario)
