@@ -225,13 +225,9 @@ def _own_scenario(
     keys: dict[str, Any] = {"log": name, "name": name, "horizon": horizon}
     keys["probe"] = _round_number(horizon / 200.0)
     keys["nodes"] = toml_text(ids)
-    readings = log.readings
+    readings = _of_network(log, log.readings, nodes, "reading")
     if len(readings):
-        readings = readings[readings["node"].isin(nodes)].sort_values("t", kind="stable")
-        if len(readings) < len(log.readings):
-            count = count_phrase(len(log.readings) - len(readings), "reading")
-            log.notes.append(f"dropped: {count} of nodes that are not in the network")
-    if len(readings):
+        readings = readings.sort_values("t", kind="stable")
         files["readings.csv"] = readings.to_csv(index=False)
         own = {*readings["node"]}
         keys["nodes"] = toml_text([node for node in ids if str(node) in own])
@@ -243,7 +239,7 @@ def _own_scenario(
     network = NETWORK.format(at="directions" if directed else "nodes")
     network += f"channel = {toml_text(channel)}\n"
     if len(log.positions):
-        placed = log.positions[log.positions["node"].isin(nodes)]
+        placed = _of_network(log, log.positions, nodes, "position")
         found = placed["node"].nunique()
         if found == len(nodes):
             files["positions.csv"] = placed.to_csv(index=False)
@@ -252,6 +248,15 @@ def _own_scenario(
             log.notes.append(f"dropped: positions, of {found} of {len(nodes)} nodes only")
     files["scenario.toml"] = HEAD.format(**keys, told=told) + plant + network + FILTER
     return files
+
+
+def _of_network(log: PacketLog, table: pd.DataFrame, nodes: list[str], what: str) -> pd.DataFrame:
+    """Return the rows of ``nodes``, the others being noted."""
+    own = table[table["node"].isin(nodes)] if len(table) else table
+    if len(own) < len(table):
+        count = count_phrase(len(table) - len(own), what)
+        log.notes.append(f"dropped: {count} of nodes that are not in the network")
+    return own
 
 
 def _round_number(value: float) -> float:

@@ -464,7 +464,7 @@ SENSORS = [{"nodes": [0], "H": [[1.0, 0.0]], "R": [[0.25]]}]
 def test_places_and_readings_beside_a_log_are_taken_whole_or_counted(tmp_path):
     rows = ["t,sender,receiver,number", *(f"{k},{k % 2},{1 - k % 2},{k}" for k in range(1, 9))]
     (tmp_path / "packets.csv").write_text("\n".join(rows))
-    places = ["t_ms,id,x,y", "1000,0,0,0", "3000,1,5,5", "4000,0,1,0", "4000,0,1,0"]
+    places = ["t_ms,id,x,y", "1000,0,0,0", "3000,1,5,5", "4000,0,1,0", "4000,0,1,0", "9,7,1,1"]
     (tmp_path / "positions.csv").write_text("\n".join(places))
     (tmp_path / "readings.csv").write_text("t,node,a,b\n-5,0,1,2\n2,0,,2\n3,1,4,5\n")
     paths, notes = netkf.import_log(tmp_path, "csv", tmp_path / "out")
@@ -478,9 +478,10 @@ def test_places_and_readings_beside_a_log_are_taken_whole_or_counted(tmp_path):
     assert "merged: 1 row of positions.csv" in text
     assert "dropped: 1 reading without a value" in text
     assert "dropped: 1 reading before time 0" in text
+    assert "dropped: 1 position of nodes that are not in the network" in text
     assert "not used: readings.csv: columns b, but a as y0" in text
     (tmp_path / "positions.csv").write_text("\n".join([*places, "4000,0,2,0"]))
-    with pytest.raises(ScenarioError, match="lines 4 and 6: a node must have one position at a t"):
+    with pytest.raises(ScenarioError, match="lines 4 and 7: a node must have one position at a t"):
         netkf.import_log(tmp_path, "csv", tmp_path / "two")
 
 
