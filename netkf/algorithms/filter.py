@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, Protocol
 
@@ -21,8 +22,9 @@ import numpy as np
 from netkf.algorithms import single
 from netkf.algorithms.models import first_root, sample_update
 from netkf.algorithms.records import Kernels
-from netkf.algorithms.traits import Analysis, Needs, Timing, Weights
-from netkf.core.fields import Component, stated
+from netkf.algorithms.traits import CLOCKS, Analysis, Needs, Timing, Weights
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import Component, Rule, stated
 from netkf.core.places import Key
 from netkf.linalg.arrays import FloatArray
 
@@ -220,6 +222,31 @@ STEPS = ("init", "predict", "update", "emit", "absorb", "estimate")
 """The methods that define a filter."""
 
 
+PHASES = ("predict", "sense", "exchange")
+
+
+def _sound_timing(timing: Any) -> Timing:
+    """Return a Timing; raises TypeError for others, and ScenarioError for a wrong value in it."""
+    if not isinstance(timing, Timing):
+        raise TypeError
+    schedule, clocks, first, age = (
+        getattr(timing, name) for name in ("schedule", "clocks", "first_slot", "max_age")
+    )
+    phases, names = (", ".join(f'"{name}"' for name in listed) for listed in (PHASES, CLOCKS))
+    is_schedule = schedule is None or (isinstance(schedule, tuple) and set(schedule) <= {*PHASES})
+    are_clocks = isinstance(clocks, tuple) and set(clocks) <= {*CLOCKS}
+    is_slot = first is None or (isinstance(first, int) and first >= 0)
+    for name, holds, rule in (
+        ("schedule", is_schedule, f"must be None or a tuple of {phases}"),
+        ("clocks", are_clocks, f"must be a tuple of {names}"),
+        ("first_slot", is_slot, "must be a whole number of at least 0"),
+        ("max_age", isinstance(age, Real) and float(age) >= 0.0, "must be a number of at least 0"),
+    ):
+        if not holds:
+            raise ScenarioError(name, rule, getattr(timing, name))
+    return timing
+
+
 @dataclass(frozen=True, eq=False)
 class Filter(Component):
     """The contract of node algorithms: how readings and messages change a node's state.
@@ -234,7 +261,7 @@ class Filter(Component):
     _called_if = MappingProxyType({"emit": "timing.talks", "absorb": "timing.talks"})
     _values = MappingProxyType(
         {
-            "timing": stated(Timing),
+            "timing": Rule("must be Timing", _sound_timing, "see netkf.parts"),
             "needs": stated(Needs),
             "link_weights": stated(Weights),
             "analysis": stated(Analysis),

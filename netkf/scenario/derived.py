@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from numbers import Real
 from typing import Any, Self, TypeVar
 
 import numpy as np
@@ -22,8 +21,8 @@ from netkf.algorithms.kernels.gains import longest_interval
 from netkf.algorithms.models import FlowModel, MapModel, RateModel, SlotModel, changing_models
 from netkf.algorithms.modes import rate_groups
 from netkf.algorithms.traits import Weights
-from netkf.core.contracts import ContractError
-from netkf.core.errors import TheoryError, quote
+from netkf.core.errors import TheoryError
+from netkf.core.fields import probability
 from netkf.core.places import Place
 from netkf.linalg.arrays import FloatArray, block_diagonal, symmetric
 from netkf.network.clocks import LinkClock
@@ -858,11 +857,8 @@ class DerivedScenario(ScenarioModel):
             return float(weights.matrix[topology.index[sender], topology.index[receiver]])
         degrees = topology.degrees[receiver], topology.degrees[sender]
         if degrees not in self._weights_by_degree:
-            weight: Any = weights.of(*degrees)
-            if not isinstance(weight, Real):
-                where = f"{type(self.node_filter).__name__}.link_weights.of"
-                raise ContractError(f"{where} must return a number, not {quote(weight)}")
-            self._weights_by_degree[degrees] = float(weight)
+            where = f"{type(self.node_filter).__name__}.link_weights.of"
+            self._weights_by_degree[degrees] = probability(where, weights.of(*degrees))
         return self._weights_by_degree[degrees]
 
     @cached_property

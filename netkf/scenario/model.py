@@ -31,6 +31,7 @@ from netkf.core.fields import (
     line,
     list_of,
     matrix,
+    number,
     one_of,
     seconds,
     source_file,
@@ -706,6 +707,8 @@ class ScenarioModel(Component):
             # Some filters send their readings.
             rows = sum(len(self.sensors[p.entry].R) for p in self.placed_sensors.get(node, ()))
             numbers = self.node_filter.analysis.payload_numbers(int(self.sizes[index]), rows, phase)
+            where = f"{type(self.node_filter).__name__}.analysis.payload_numbers"
+            numbers = number(low=0.0)(where, numbers)
             coded = self.network.quantise
             size = radio.bytes_per_number if coded is None else coded.bits / 8.0
             self._message_sizes[node, phase] = size * numbers

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -20,6 +21,20 @@ from netkf.scenario.stamps import stamp_notes
 from netkf.scenario.tables import change_keys
 from netkf.scenario.time_grid import grid_notes
 from netkf.scenario.usage import repeat_notes
+
+
+@contextmanager
+def _explained(scenario: Scenario) -> Iterator[None]:
+    """Turn an error of a user's class into a ScenarioError that names the class and the method."""
+    try:
+        yield
+    except (NetkfError, OSError):
+        raise
+    except Exception as error:
+        rule = explain_user_error(scenario, error)
+        if rule is None:
+            raise
+        raise ScenarioError("", rule, None, "correct the class or its settings") from error
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -44,16 +59,9 @@ class Scenario(DerivedScenario):
     """
 
     def __post_init__(self) -> None:
-        try:
+        with _explained(self):
             super().__post_init__()
             check_scenario(self)
-        except (NetkfError, OSError):
-            raise
-        except Exception as error:
-            rule = explain_user_error(self, error)
-            if rule is None:
-                raise
-            raise ScenarioError("", rule, None, "correct the class or its settings") from error
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the fields and the topology, whose file may not exist where this is loaded."""
@@ -84,10 +92,12 @@ class Scenario(DerivedScenario):
     @cached_property
     def notes(self) -> tuple[str, ...]:
         """Remarks for the user before a run, one line each, such as unused rows of a table."""
-        notes = self.node_filter.needs.notes
+        make = self.node_filter.needs.notes
+        with _explained(self):
+            notes = () if make is None else tuple(make(self))
         return (
             *self.topology.notes,
-            *(notes(self) if notes is not None else ()),
+            *notes,
             *repeat_notes(self),
             *record_notes(self),
             *sampling_notes(self),

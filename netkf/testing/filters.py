@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from netkf.algorithms.filter import Filter, commutes
-from netkf.algorithms.traits import CLOCKS, Needs, Timing, Weights
+from netkf.algorithms.traits import Needs, Timing, Weights
 from netkf.linalg.arrays import FloatArray
 from netkf.testing.observed import Seen
 from netkf.testing.parents import check_parent
@@ -17,7 +17,6 @@ from netkf.testing.watching import WatchedPart, checker, demand_kind, is_number,
 
 MAX_DEGREE = 8  # weights are checked for all pairs of degrees up to it
 SHIFT_TOLERANCE = 1e-9  # relative to the estimates before the shift is subtracted
-PHASES = ("predict", "sense", "exchange")
 
 
 @checker
@@ -82,15 +81,10 @@ def _check_values(watched: WatchedPart) -> None:
     part, demand = watched.part, watched.demand
     _check_flags(watched, "needs", part.needs, Needs)
     _check_flags(watched, "timing", part.timing, Timing)
-    clocks, slot = part.timing.clocks, part.timing.first_exchange
-    are_clocks = isinstance(clocks, tuple) and set(clocks) <= set(CLOCKS)
-    text = ", ".join(f'"{clock}"' for clock in CLOCKS)
-    demand("timing.clocks", are_clocks, f"must be a tuple of {text}", clocks)
+    clocks = part.timing.clocks
     can_run = bool(clocks) or part.timing.schedule is not None or not part.timing.talks
     rule = "must name a clock where schedule is None: the filter could not run at all"
     demand("timing.clocks", can_run, rule, clocks)
-    is_count = isinstance(slot, int) and slot >= 0
-    demand("timing.first_slot", is_count, "must be a whole number of at least 0", slot)
 
 
 def _check_flags(watched: WatchedPart, name: str, value: Any, kind: type[Any]) -> None:
@@ -104,9 +98,6 @@ def _check_flags(watched: WatchedPart, name: str, value: Any, kind: type[Any]) -
 
 def _check_schedule(watched: WatchedPart) -> None:
     schedule, demand = watched.part.timing.schedule, watched.demand
-    are_phases = isinstance(schedule, tuple) and set(schedule) <= set(PHASES)
-    text = ", ".join(f'"{phase}"' for phase in PHASES)
-    demand("timing.schedule", are_phases, f"must be None or a tuple of {text}", schedule)
     rule = 'must have one "predict" and one "sense" at most'
     no_repeats = max(schedule.count("predict"), schedule.count("sense")) <= 1
     demand("timing.schedule", no_repeats, rule, schedule)

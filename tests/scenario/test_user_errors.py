@@ -96,8 +96,17 @@ MISTAKES = {
     "a timing that is a table": ("FILTER", f"timing = {{'talks': True}}\n{SAME}", r"F\.timing: must be Timing; got \{"),
     "weight fails": ("FILTER", f"def weight(self, *degrees): return 1 / 0\n{WEIGHTS}",
                      r"F failed in weight: ZeroDivisionError.*; FILE, line 6"),
+    "weights beyond 1": ("FILTER", f"link_weights = Weights(of=lambda *degrees: 5.0)\n{SAME}",
+                         r"F\.link_weights\.of: must be a finite number .*; got 5\.0"),
+    "a schedule that is a text": ("FILTER", f"timing = Timing(schedule='exchange')\n{SAME}",
+                                  r'F\.timing\.schedule: must be None or a tuple of "predict", "sense", "exchange"; got'),
+    "an age that is a text": ("FILTER", f"timing = Timing(max_age='x')\n{SAME}", r"F\.timing\.max_age: must be a number"),
+    "notes fail": ("FILTER", f"needs = Needs(notes=lambda scenario: 1 / 0)\n{SAME}",
+                   r"F failed in needs: ZeroDivisionError.*; FILE, line 6"),
+    "payload numbers are a text": ("FILTER", f"analysis = Analysis(payload_numbers=lambda *sizes: 'x')\n{SAME}",
+                                   r"F\.analysis\.payload_numbers: must be a finite number at least 0; got 'x'"),
     "weight is a text": ("FILTER", f"def weight(self, *degrees): return 'x'\n{WEIGHTS}",
-                         r"F.link_weights.of must return a number, not 'x'"),
+                         r"F\.link_weights\.of: must be a finite number at least 0 and at most 1; got 'x'"),
     "absorb exits": ("FILTER", "def absorb(self, state, messages, exchange): raise SystemExit(3)",
                      r"F\.absorb \(FILE, line 6\) called exit"),
     "it cannot be made": ("FILTER", f"def __post_init__(self): raise RuntimeError('no')\n{SAME}",
@@ -240,7 +249,8 @@ def test_one_line_names_class_method_file_and_line(name, tmp_path, monkeypatch, 
             lines = [line for line in printed.splitlines() if "compiling" not in line]
             assert len(lines) == 1, printed
             assert re.search(pattern, lines[0]), lines[0]
-            if "mean_delivery" not in body:  # a summary asks for it, after the run
+            # What a summary or a command asks for, no simulation does.
+            if "mean_delivery" not in body and "notes" not in body:
                 with pytest.raises(netkf.NetkfError, match=pattern):
                     netkf.simulate(netkf.load("own.toml"), engine=engine)
             if "must define" in words or "must take" in words:
