@@ -9,6 +9,7 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.places import Place
+from netkf.core.printable import list_some
 from netkf.core.repeated_rows import RowUse, add_uses, count_rows
 from netkf.linalg.arrays import FloatArray
 from netkf.network.contacts import Contacts
@@ -231,8 +232,7 @@ def record_notes(scenario: DerivedScenario) -> tuple[str, ...]:
     unused_slots = sorted({slot for slot, _, _ in activation.recorded} - set(used_slots))
     if not unused_slots:
         return ()
-    listed = ", ".join(map(str, unused_slots[:3])) + (", ..." if len(unused_slots) > 3 else "")
     return (
-        f"{activation.path.name}: rows of slot {listed} are not used; there are exchanges in slots "
-        f"{used_slots.start} to {used_slots.stop - 1}",
+        f"{activation.path.name}: rows of slot {list_some(unused_slots, 3)} are not used; there "
+        f"are exchanges in slots {used_slots.start} to {used_slots.stop - 1}",
     )

@@ -16,6 +16,7 @@ from netkf.core.clock import Clock, stated_rate
 from netkf.core.contracts import is_netkf_class
 from netkf.core.errors import ScenarioError, errors_under, quote
 from netkf.core.places import Place
+from netkf.core.printable import list_some
 from netkf.linalg.arrays import FloatArray
 from netkf.network.node_clocks import node_time
 from netkf.plants.nonlinear import NonlinearSensor
@@ -214,6 +215,5 @@ def sampling_notes(scenario: ScenarioModel) -> tuple[str, ...]:
             continue
         nodes = [node for node in sensor.nodes if not len(record.rows(node).t)]
         if nodes:
-            listed = ", ".join(map(str, nodes[:3])) + (", ..." if len(nodes) > 3 else "")
-            notes.append(f"{record.path.name} has no readings of node {listed}")
+            notes.append(f"{record.path.name} has no readings of node {list_some(nodes, 3)}")
     return tuple(notes)

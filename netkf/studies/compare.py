@@ -19,7 +19,7 @@ import scipy
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import as_path, number
 from netkf.core.notebook import NotebookTable
-from netkf.core.printable import shorten
+from netkf.core.printable import list_some, shorten
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import name_rows
 from netkf.runs.documents import (
@@ -267,7 +267,7 @@ class Comparison(NotebookTable):
 
     def __repr__(self) -> str:
         real = sum(any(entry.real for entry in row.entries) for row in self.rows)
-        names = ", ".join(self.directories[:3]) + (", ..." if len(self.directories) > 3 else "")
+        names = list_some(self.directories, 3)
         return f"<netkf comparison of {names}: {real} of {len(self.rows)} rows differ for certain>"
 
     def remarks(self) -> list[str]:

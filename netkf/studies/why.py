@@ -10,7 +10,7 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import integer, number
-from netkf.core.printable import shorten
+from netkf.core.printable import list_some, shorten
 from netkf.ensembles.stored import StoredEnsemble
 from netkf.network.deliveries import MessageKey
 from netkf.runs.outcomes import downtimes
@@ -138,9 +138,8 @@ def _check_run(
 def _find_node(scenario: Scenario, node: int | str) -> int:
     found = scenario.topology.find(str(node))
     if found is None:
-        listed = ", ".join(map(str, scenario.nodes[:8]))
-        listed += ", ..." if len(scenario.nodes) > 8 else ""
-        raise ScenarioError("node", "must be a node of the scenario", node, f"nodes: {listed}")
+        remedy = f"nodes: {list_some(scenario.nodes, 8)}"
+        raise ScenarioError("node", "must be a node of the scenario", node, remedy)
     return found
 
 

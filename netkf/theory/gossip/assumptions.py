@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from netkf.core.errors import TheoryError
+from netkf.core.printable import list_some
 from netkf.network.losses import NoLoss
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import AssumptionRow
@@ -63,8 +64,8 @@ def _walk_rows(scenario: Scenario) -> list[AssumptionRow]:
                 "sufficient, not necessary: a mode that decays by itself need not be seen",
             )
         ]
-    listed = ", ".join(map(str, walk[:MAX_LISTED])) + (", ..." if len(walk) > MAX_LISTED else "")
-    return [(name, "G D.1", True, f"the Gramian of the walk ({listed}) is invertible")]
+    evidence = f"the Gramian of the walk ({list_some(walk, MAX_LISTED)}) is invertible"
+    return [(name, "G D.1", True, evidence)]
 
 
 def _swap_rows(scenario: Scenario) -> list[AssumptionRow]:

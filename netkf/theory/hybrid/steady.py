@@ -19,6 +19,7 @@ import numpy as np
 import scipy
 
 from netkf.core.errors import TheoryError
+from netkf.core.printable import list_some
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.spectra import growth_rate
 from netkf.network.spectra import connected_parts
@@ -186,12 +187,8 @@ def _implicit_step(implicit: PackedRiccati, P: FloatArray) -> FloatArray | None:
 def _no_steady_state(scenario: Scenario, equations: CoupledRiccati) -> str:
     if not equations.talks:
         unsteady = np.isnan(steady_by_node(scenario)[:, 0, 0])
-        unsteady_nodes = [
-            str(node) for node, no in zip(scenario.nodes, unsteady, strict=True) if no
-        ]
-        listed = ", ".join(unsteady_nodes[:MAX_LISTED]) + (
-            ", ..." if len(unsteady_nodes) > MAX_LISTED else ""
-        )
+        unsteady_nodes = [node for node, no in zip(scenario.nodes, unsteady, strict=True) if no]
+        listed = list_some(unsteady_nodes, MAX_LISTED)
         talks = scenario.filter.algorithm.timing.talks
         reason = "no message ever arrives" if talks else "the filter does not talk"
         plural = "s" if len(unsteady_nodes) > 1 else ""
