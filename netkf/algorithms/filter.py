@@ -117,6 +117,11 @@ class NodeInfo(NamedTuple):
     whole: tuple[Any, ...] = ()
     heard: tuple[tuple[Any, ...], ...] = ()
 
+    def is_own(self, H: FloatArray) -> np.ndarray:
+        """Return the rows (p,) of H (p, n) that depend on blocks of the node alone."""
+        own = sum(place.n for place in self.blocks) or H.shape[1]
+        return np.asarray(~H[:, own:].any(axis=1))
+
 
 class Exchange(NamedTuple):
     """The circumstances of ``emit`` or ``absorb``.

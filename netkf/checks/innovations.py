@@ -85,13 +85,13 @@ class Recorded(NamedTuple):
 class TimedState(NamedTuple):
     """The state of a filter, ``inner``, with what an innovation needs besides.
 
-    node  : node of the state; -1 for a pooled filter, which reads all sensors
+    info  : of the node of the state
     time  : present time of the state, seconds
     start : estimate (n,) and P (n, n), or None, before the last prediction
     """
 
     inner: Any
-    node: int
+    info: NodeInfo
     time: float
     start: tuple[FloatArray, FloatArray | None]
 
@@ -160,12 +160,12 @@ class Recorder(Filter):
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> TimedState:
         """Return the state at time 0 with the estimate ``mean`` (n,), ``cov`` (n, n)."""
         inner = self.inner.init(model, mean, cov, node)
-        return TimedState(inner, -1 if self.timing.pooled else node.node, 0.0, (mean, None))
+        return TimedState(inner, node, 0.0, (mean, None))
 
     def predict(self, state: TimedState, gap: float) -> TimedState:
         """Return the state predicted over ``gap`` seconds, with the estimate before it."""
         inner, start = self.inner.predict(state.inner, gap), self.inner.estimate(state.inner)
-        return TimedState(inner, state.node, state.time + gap, start)
+        return TimedState(inner, state.info, state.time + gap, start)
 
     def update(self, state: TimedState, reading: Any) -> TimedState:
         """Update as the filter does; append the innovation first."""
@@ -173,17 +173,20 @@ class Recorder(Filter):
         innovation = (self._of_sample if sampled else self._of_increments)(state, reading)
         if innovation is not None:
             time = reading.time if sampled else state.time
-            self.recorded.append(Recorded(time, state.node, *innovation, not sampled))
+            node = -1 if self.timing.pooled else state.info.node
+            self.recorded.append(Recorded(time, node, *innovation, not sampled))
         return state._replace(inner=self.inner.update(state.inner, reading))
 
     def _of_sample(self, state: TimedState, reading: Any) -> tuple[FloatArray, FloatArray] | None:
         xhat, P = self.inner.estimate(state.inner)
-        if not len(reading.y):
+        # How errors of other blocks correlate is not known.
+        rows = slice(None) if self.timing.pooled else state.info.is_own(reading.H)
+        y, H, R = reading.y[rows], reading.H[rows], reading.R[rows][:, rows]
+        if not len(y):
             return None
         if P is None or not np.isfinite(P).all():
-            return np.full(len(reading.y), np.nan), np.eye(len(reading.y))
-        S = reading.H @ P @ reading.H.T + reading.R
-        return reading.y - reading.H @ xhat, np.linalg.cholesky(S)
+            return np.full(len(y), np.nan), np.eye(len(y))
+        return y - H @ xhat, np.linalg.cholesky(H @ P @ H.T + R)
 
     def _of_increments(
         self, state: TimedState, reading: Any

@@ -16,6 +16,7 @@ from scipy.optimize import minimize_scalar
 from scipy.stats import chi2
 
 import netkf
+from netkf.checks.innovations import compute_innovations
 
 AREAS = """
 format = 1
@@ -263,6 +264,14 @@ def test_theory_takes_states_in_the_order_of_each_node(tmp_path: Path, text: str
     mean = text.replace("cov = [[1.5]]", "cov = [[1.5]]\nmean = [7.0]")
     rows = netkf.theory.assumptions(load(mean, tmp_path))
     assert rows[rows["assumption"].str.startswith("P_i(0)")]["holds"].tolist() == [True]
+
+
+def test_innovations_are_of_own_blocks(tmp_path: Path) -> None:
+    """How errors of two nodes correlate is not known, so readings across a border have no S."""
+    run = netkf.simulate(load(AREAS.replace("[network]", FLOWS, 1), tmp_path))
+    found = compute_innovations(run)
+    assert (found.rows == 1).all()
+    assert np.count_nonzero(found.nodes == 2) == run.count("sense") // 3
 
 
 def test_a_reading_across_a_border_is_used_by_covariance_intersection(tmp_path: Path) -> None:

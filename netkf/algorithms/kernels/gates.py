@@ -31,6 +31,7 @@ class GateTables(Struct):
     limits : (P + 1,), the largest normalised innovation squared of so many numbers that is taken
     inflates : 1 if R of a part that is refused is multiplied, 0 if the part is ignored
     active : runs side by side that there are, at most L
+    own : (H,), how many states of each node are of its own blocks: others pass
     first : (K + 1,), the parts of list k are ``first[k]`` to ``first[k + 1]`` - 1
     row, length : (G,), first row and number of rows of each part
     scale : (G, L), by which its rows were multiplied
@@ -40,6 +41,7 @@ class GateTables(Struct):
     limits: FloatArray
     inflates: int
     active: int
+    own: IntArray
     first: IntArray
     row: IntArray
     length: IntArray
@@ -51,10 +53,15 @@ class GateTables(Struct):
 
 
 def gate_tables(
-    gate: Gate, n: int, runs: tuple[int, int], parts: Sequence[Sequence[tuple[int, int]]]
+    gate: Gate,
+    n: int,
+    runs: tuple[int, int],
+    parts: Sequence[Sequence[tuple[int, int]]],
+    own: IntArray,
 ) -> GateTables:
-    """Return the tables of a gate for estimates of n states: ``runs`` = (L, active), and for each
-    list of parts the (row, length) of each of its ``parts``.
+    """Return the tables of a gate for estimates of n states, ``own`` (H,) of them of the own blocks
+    of each node: ``runs`` = (L, active), and for each list of parts the (row, length) of each of
+    its ``parts``.
     """
     every = np.array([part for some in parts for part in some], dtype=np.int64).reshape(-1, 2)
     most = int(every[:, 1].max(initial=0))
@@ -62,6 +69,7 @@ def gate_tables(
         limits=np.array([math.inf, *(gate.limit(p) for p in range(1, most + 1))]),
         inflates=gate.then == "inflate",
         active=runs[1],
+        own=own,
         first=np.cumsum([0, *map(len, parts)], dtype=np.int64),
         row=every[:, 0].copy(),
         length=every[:, 1].copy(),
@@ -73,10 +81,18 @@ def gate_tables(
     )
 
 
+def own_sizes(infos: Sequence[Any], n: int, pooled: bool) -> IntArray:
+    """Return how many of its n states each node has of its own blocks: all without any, and of a
+    ``pooled`` filter.
+    """
+    sizes = [n if pooled else sum(place.n for place in info.blocks) or n for info in infos]
+    return np.array(sizes, dtype=np.int64)
+
+
 @cache
 def no_gate() -> GateTables:
     """Return the tables of a run without a gate."""
-    return gate_tables(Gate(probability=0.5), 0, (1, 0), [])
+    return gate_tables(Gate(probability=0.5), 0, (1, 0), [], np.zeros(0, dtype=np.int64))
 
 
 @kernel
@@ -117,6 +133,8 @@ def _scale_of_part(record: Any, h: int, g: int, q: int, run: Any) -> float:
         for j in range(n):
             z -= run.H[H, i, j, q] * x[h, j, q]
             is_read |= run.H[H, i, j, q] != 0.0
+            if j >= gate.own[h] and run.H[H, i, j, q] != 0.0:
+                return 1.0
             total = 0.0
             for m in range(j, n):
                 total += run.H[H, i, m, q] * root[h, m, j, q]

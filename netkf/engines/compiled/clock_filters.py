@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from netkf.algorithms.kernels.at_rest import empty_inbox, run_at_rest
-from netkf.algorithms.kernels.gates import GateTables, gate_tables, no_gate
+from netkf.algorithms.kernels.gates import GateTables, gate_tables, no_gate, own_sizes
 from netkf.algorithms.kernels.nonlinear_rows import linear_rows
 from netkf.algorithms.kernels.pairs import no_pairs, pairs_of
 from netkf.algorithms.kernels.rates import RateRun
@@ -57,13 +57,14 @@ class ClockFilters:
         columns = BlockColumns(scenario, entries_of(scenario))
         self._columns, self._n = (columns.width, columns.entries.shape[1]), scenario.plant.n
         self._gate = scenario.filter.gate
+        pooled = scenario.node_filter.timing.pooled
+        infos = scenario.node_infos[:1] if pooled else scenario.node_infos
+        self._own = own_sizes(infos, self._columns[1], pooled)
         self._readings = None
         if not (linear := all(sensor.linear for sensor in scenario.sensors)):
             self._readings = nonlinear_sensors(scenario)
             self._p = self._readings.R.shape[1]
         self._rates = [m for m in scenario.model_pieces[0] if isinstance(m, RateModel)]
-        pooled = scenario.node_filter.timing.pooled
-        infos = scenario.node_infos[:1] if pooled else scenario.node_infos
         models = changing_models(wide_models(scenario), scenario.followed_changes.tolist())
         links = _links_by_receiver(scenario)
         starts = list(zip(start.xhat, start.root, strict=True))
@@ -202,7 +203,7 @@ class ClockFilters:
         if self._gate is None:
             return no_gate()
         parts = [(0, self._p)] * self._samples
-        return gate_tables(self._gate, self._columns[1], (1, 1), [parts])
+        return gate_tables(self._gate, self._columns[1], (1, 1), [parts], self._own)
 
     def advance(self, state: Simulation) -> int:
         """Run the event loop until it needs something from Python; return its request."""

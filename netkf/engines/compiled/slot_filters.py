@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from netkf.algorithms.kernels.at_rest import run_at_rest
-from netkf.algorithms.kernels.gates import gate_tables
+from netkf.algorithms.kernels.gates import gate_tables, own_sizes
 from netkf.algorithms.kernels.maps import MapRun
 from netkf.algorithms.kernels.pairs import Pairs, no_pairs
 from netkf.algorithms.kernels.run import (
@@ -120,7 +120,13 @@ class SlotFilters:
         most = max(1, int(np.diff(setup.links.first).max(initial=0)))
         own = {"common": setup.common, "pairs": pairs, "gap": setup.period}
         if setup.gate is not None:
-            own["gate"] = gate_tables(setup.gate, n, (LANES, active), setup.gated_parts)
+            own["gate"] = gate_tables(
+                setup.gate,
+                n,
+                (LANES, active),
+                setup.gated_parts,
+                own_sizes(setup.infos, n, setup.algorithm.timing.pooled),
+            )
         return cls(
             **run_at_rest(n, LANES, most) | own,
             size=size,

@@ -326,7 +326,12 @@ class Node:
         """
         if self._gate is None:
             return samples
-        factors = [self._gate_factor(sample, time, -1, recorder) for sample in samples]
+        factors = [
+            self._gate_factor(sample, time, -1, recorder)
+            if self._timing.pooled or self.info.is_own(sample[1]).all()
+            else 1.0
+            for sample in samples
+        ]
         passed: list[Sample] = []
         for (y, H, R), factor in zip(samples, factors, strict=True):
             if np.isfinite(factor):
