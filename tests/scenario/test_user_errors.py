@@ -289,6 +289,26 @@ def test_what_only_theory_asks_for_is_held_to_its_rule(ring):
         netkf.theory.assumptions(scenario)
 
 
+@dataclass(frozen=True, eq=False)
+class Rows(parts.Filter):
+    """Says that it is affine, and does not take several columns."""
+
+    analysis = parts.Analysis(affine=True)
+    shift = parts.Filter.shift
+
+    def absorb(self, state, messages, exchange):
+        return state._replace(xhat=state.xhat + np.ones(2) * (state.xhat[0] - state.xhat[0]))
+
+
+def test_theory_names_the_class_that_it_calls(ring):
+    scenario = ring.replace({"filter": Rows(), "horizon": 2.0})
+    run = netkf.simulate(scenario)
+    with pytest.raises(
+        netkf.EngineError, match=r"Rows failed in absorb: ValueError: operands .*; .*, line"
+    ):
+        netkf.theory.error_covariance(scenario, run)
+
+
 def test_a_covariance_that_is_not_symmetric_ends_a_run(ring):
     with pytest.raises(
         netkf.EngineError, match=r"Skew failed after estimate .* P must be symmetric"

@@ -11,6 +11,7 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.network.graphs import Topology
+from netkf.runs.failures import explain_failures
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.blocks import have_one_view, scenario_of_view
 
@@ -76,7 +77,8 @@ def _check_first_argument(name: str, function: Callable[..., Any]) -> Callable[.
         for key in flags & given.keys():
             if not isinstance(given[key], (bool, np.bool_)):
                 raise TheoryError(f"{key} must be True or False, got {given[key]!r}")
-        return function(scenario if name in WITH_TIME else scenario.last_piece, *args, **kwargs)
+        with explain_failures(scenario):
+            return function(scenario if name in WITH_TIME else scenario.last_piece, *args, **kwargs)
 
     # Pickle finds a function by these two names: the wrapper replaces the original under them.
     checked.__module__, checked.__qualname__ = "netkf.theory", name
