@@ -66,6 +66,8 @@ def test_records_leave_their_law_unknown(build, tmp_path):
 class NoLoss(channels.NoLoss):
     """A loss of its own that bears the name of the lossless one."""
 
+    deterministic = False
+
     def delivery_probability(self, sent):
         return 0.5
 
