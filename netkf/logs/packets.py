@@ -182,13 +182,11 @@ def find_lead(numbers: FloatArray, times: FloatArray, who: np.ndarray) -> FloatA
     """
     order = np.lexsort((times, numbers))
     t, same, by = times[order], np.diff(numbers[order]) == 0, who[order]
-    gaps = np.where(same, np.diff(t), np.inf)
-    before, after = np.append(np.inf, gaps[:-1]), np.append(gaps[1:], np.inf)
     # Rows of one number after a wrap are further apart, one of one reporter by a cycle.
     cycles = pd.Series(times).groupby([numbers, who]).diff()
     cycle = float(cycles[cycles > 0.0].quantile(0.1)) if (cycles > 0.0).any() else np.inf
-    chosen = same & (by[1:] != by[:-1]) & ((gaps <= before) | (gaps <= after))
-    chosen &= gaps < 0.5 * cycle
+    gaps = np.diff(t)
+    chosen = same & (by[1:] != by[:-1]) & (gaps < 0.5 * cycle)
     low, high = np.minimum(by[1:], by[:-1])[chosen], np.maximum(by[1:], by[:-1])[chosen]
     apart = pd.Series(np.where(by[1:] > by[:-1], 1.0, -1.0)[chosen] * gaps[chosen])
     found = apart.groupby([low, high]).agg(["median", "size"])

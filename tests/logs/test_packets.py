@@ -9,7 +9,7 @@ import pytest
 import netkf
 from netkf.cli.main import main
 from netkf.core.errors import ScenarioError
-from netkf.logs.packets import unwrap
+from netkf.logs.packets import find_lead, unwrap
 from netkf.scenario.writing import as_table, to_toml
 from tests.conftest import SCENARIOS
 
@@ -248,6 +248,15 @@ def test_stamps_may_be_coarse_and_clocks_apart(tmp_path, modulus, interval, stam
     assert {link: own.tolist() for link, own in outcomes} == true
     sent = table(tmp_path / "out", "transmissions.csv").groupby("node")["t"]
     assert all(own.is_unique for _, own in sent)
+
+
+def test_clocks_that_are_near_each_other_in_two_parties_are_told_apart():
+    """Of each number two stamps are near each other on both sides of a wide gap."""
+    ahead = np.array([0.0, 0.5, 30.0, 30.5])
+    times, numbers = (10.0 * np.arange(50)[:, None] + ahead).ravel(), np.repeat(np.arange(50), 4)
+    order, who = np.argsort(times), np.tile(np.arange(4), 50)
+    found = find_lead(numbers[order], times[order], who[order])
+    np.testing.assert_allclose(found, ahead[who[order]], atol=1e-9)
 
 
 def test_what_a_receiver_was_off_for_is_no_silence(tmp_path):
