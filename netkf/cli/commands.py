@@ -182,6 +182,19 @@ def parse_duration(text: str) -> float:
     raise argparse.ArgumentTypeError(f"{DURATION_RULE}; got {quote(text)}")
 
 
+MARGIN = 2
+"""Minutes of a job of an array that are left for its start, and for the end of its last block."""
+
+
+def parse_time_limit(text: str) -> float:
+    """Return the seconds of a job, more than MARGIN minutes; raises ArgumentTypeError."""
+    seconds = parse_duration(text)
+    if round(seconds / 60) <= MARGIN:
+        rule = f"must be longer than the {MARGIN} minutes in which a job starts and ends"
+        raise argparse.ArgumentTypeError(f"{rule}; got {quote(text)}")
+    return seconds
+
+
 def parse_columns(text: str) -> dict[str, str]:
     """Return NAME=COLUMN,... as a dictionary; raises argparse.ArgumentTypeError."""
     pairs = [pair.partition("=") for pair in text.split(",")]
@@ -251,7 +264,7 @@ ARRAY = (
     _option(
         "--time",
         "time limit of each job in that script, such as 1h or 01:00:00 (default: 1h)",
-        type=parse_duration,
+        type=parse_time_limit,
         metavar="DURATION",
     ),
 )

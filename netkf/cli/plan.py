@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from netkf.cli.commands import MARGIN
 from netkf.cli.options import load_scenario, print_notes
 from netkf.core.printable import count_phrase
 
@@ -38,8 +39,6 @@ exit $status
 # It lists the jobs whose runs are missing; sbatch --array=3,7-9 submits those of a list again.
 """
 TASKS = 64
-MARGIN = 2
-"""Minutes of a job that are left for its start, and for the end of its last block."""
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -73,8 +72,8 @@ def print_plan(
 def _array(directory: Path, name: str, tasks: int, options: argparse.Namespace) -> str:
     """Return the submission script of an array of ``tasks`` SLURM jobs on a plan."""
     trust = ["--trust"] if options.trust else []
-    minutes = max(1, round((options.time or 3600) / 60))
-    limit = f"{max(1, minutes - MARGIN)}m"
+    minutes = round((options.time or 3600) / 60)
+    limit = f"{minutes - MARGIN}m"
     return ARRAY.format(
         name="".join(c if c.isalnum() or c in "-_." else "-" for c in f"netkf-{name}")[:100],
         last=tasks - 1,

@@ -82,7 +82,7 @@ def work_on_study(plan: Plan, part: Part, pool: PoolOptions, options: argparse.N
     from netkf.runs.failures import InterruptedRunError
 
     study_options = _study_options(plan, options)
-    rounds = has_rounds(study_options)
+    rounds, study_options.works = has_rounds(study_options), True
     with ProgressLine() as line:
         worker = Worker(part, options.seconds, line.make_count_update("runs"))
         while True:

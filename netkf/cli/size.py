@@ -42,6 +42,7 @@ def _run(options: argparse.Namespace) -> int:
         )
     else:
         print(format_sizing(sizing))
-    if not sizing:
+    # Each worker of a plan finds the same answer, which merge prints.
+    if not sizing and not getattr(options, "works", False):
         print(f"netkf: {format_answer(sizing)}", file=sys.stderr)
     return 0 if sizing else FAILED

@@ -12,7 +12,7 @@ from netkf.core.errors import ScenarioError, errors_under, suggest_nearest
 from netkf.core.places import Place
 from netkf.core.printable import list_some
 from netkf.network.graphs import Topology
-from netkf.plants.blocks import Layout
+from netkf.plants.blocks import CHOICES, Layout
 from netkf.plants.nonlinear import PositionedSensor
 from netkf.plants.recorded import RecordedSensor
 from netkf.plants.relative import RelativePositionSensor, RelativeSensor
@@ -83,9 +83,6 @@ def unheard_notes(scenario: Any) -> tuple[str, ...]:
             rule = "nobody who hears the reader estimates the block of the other"
             notes.append(f"sensors[{k}]: readings by {list_some(unheard, 3)} are not used: {rule}")
     return tuple(notes)
-
-
-CHOICES = ("all", "own", "own+neighbours", "shared")
 
 
 def estimated_blocks(

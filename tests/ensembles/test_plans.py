@@ -355,6 +355,13 @@ def test_durations_have_letters_or_the_forms_of_slurm(plan, capsys):
         assert "such as 50m or 1h30m, or a time limit of SLURM, not 0: MINUTES, " in error
 
 
+def test_a_job_has_time_beside_its_start_and_end(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main(["plan", *LINE, "--out", str(tmp_path / "plan"), "--slurm", "--time", "2m"])
+    assert "--time: must be longer than the 2 minutes in which a job" in capsys.readouterr().err
+    assert not (tmp_path / "plan").exists()
+
+
 def test_slurm_script(tmp_path, capsys):
     line = ["--out", str(tmp_path / "my plan"), "--tasks", "8", "--slurm", "--time", "01:30:00"]
     assert main(["plan", *LINE, *line]) == 0

@@ -348,6 +348,7 @@ def test_readings_of_pairs_that_reach_nobody_are_noted(
         ),
         ("[network]", "[plant]\nkind = 'diffusion'\n[network]", "plant", "beside [[plants]]"),
         ("[[plants]]\n", "[[plants]]\nkind = 'recorded'\npath = 'x.csv'\n", "plants[0]", None),
+        ('name = "pose"', 'name = "own"', "plants[0].name", "no word of filter.estimates"),
     ],
 )
 def test_mistakes_in_blocks_are_named(
