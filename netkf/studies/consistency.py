@@ -412,14 +412,15 @@ def judge_consistency(
     ]
     largest = int(np.argmax(sizes))
     blurred_from = min(run.blurred_from[0] for run in runs)
-    notes = () if any(run.covariance_given[0] for run in runs) else (NO_COVARIANCE,)
+    given = any(run.covariance_given[0] for run in runs)
+    notes = () if given else (NO_COVARIANCE,)
     if _count_errors(scenario) > MAX_ERRORS:
         reason = (
             f"the expected NEES is left out: the exact covariance of {_count_errors(scenario):,} "
             f"errors, more than {MAX_ERRORS}, takes long; netkf.theory.error_covariance computes it"
         )
         notes = (*notes, reason)
-    if why := runs[0].reason[0]:
+    if given and (why := runs[0].reason[0]):
         notes = (*notes, f"the expected NEES is unknown: {why}")
     if unjudged := unjudged_line(scenario):
         notes = (*notes, f"not judged: {unjudged}, so that errors have no known law")

@@ -55,7 +55,7 @@ def scenario_of_estimates(scenario: Scenario) -> Scenario:
         return scenario
     if have_one_view(scenario):
         return scenario_of_view(scenario)
-    known = "; known are theory.central_covariance and theory.error_covariance"
+    known = "; of these are known theory.central_covariance and theory.error_covariance"
     reason = "not known of nodes that estimate different blocks of the state"
     raise TheoryError(reason + (known if scenario.is_linear else ""))
 
