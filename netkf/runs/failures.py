@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from netkf.core.errors import EngineError, NetkfError
-from netkf.scenario.plugins import explain_user_error
+from netkf.scenario.plugins import explain_user_error, explained
 from netkf.scenario.scenario import Scenario
 
 
@@ -39,13 +38,6 @@ def explain_failure(
     return error if message is None else EngineError(f"{message}{where}")
 
 
-@contextmanager
-def explain_failures(scenario: Scenario) -> Iterator[None]:
+def explain_failures(scenario: Scenario) -> AbstractContextManager[None]:
     """Turn exceptions of a user's class in the body into an EngineError that names it."""
-    try:
-        yield
-    except Exception as error:
-        explained = explain_failure(scenario, error)
-        if explained is error:
-            raise
-        raise explained from error
+    return explained(scenario, EngineError)

@@ -7,13 +7,14 @@ import dataclasses
 import inspect
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import CodeType, FrameType, FunctionType
 from typing import Any
 
 from netkf.core.contracts import ContractError, is_netkf_class, last_call, place_of, place_of_error
-from netkf.core.errors import quote
+from netkf.core.errors import NetkfError, quote
 from netkf.core.fields import Component, walk
 from netkf.plants.dynamics import CustomDynamics
 
@@ -116,6 +117,20 @@ def explain_user_error(scenario: Any, error: Exception) -> str | None:
         return f"{_name_of(type(components[0]))} failed: {text}"
     where = f"{call.function.__name__} ({place_of(call.function.__code__)})"
     return f"{_name_of(call.cls)} failed after {where} returned {quote(call.result)}: {text}"
+
+
+@contextmanager
+def explained(scenario: Any, make: Callable[[str], Exception]) -> Iterator[None]:
+    """Turn an error of a user's class in the body into what ``make`` makes of its explanation."""
+    try:
+        yield
+    except (NetkfError, OSError):  # they name their cause, and a full disk is not of the class
+        raise
+    except Exception as error:
+        rule = explain_user_error(scenario, error)
+        if rule is None:
+            raise
+        raise make(rule) from error
 
 
 def _codes_of(member: Any) -> list[CodeType]:

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 from netkf.algorithms.kernels.maps import METHODS
-from netkf.core.errors import NetkfError, ScenarioError
+from netkf.core.errors import ScenarioError
 from netkf.scenario.block_sensors import unheard_notes
 from netkf.scenario.checks import check_scenario
 from netkf.scenario.derived import DerivedScenario
-from netkf.scenario.plugins import explain_user_error
+from netkf.scenario.plugins import explained
 from netkf.scenario.records import record_notes
 from netkf.scenario.sampling import sampling_notes
 from netkf.scenario.stamps import stamp_notes
@@ -23,18 +22,8 @@ from netkf.scenario.time_grid import grid_notes
 from netkf.scenario.usage import repeat_notes
 
 
-@contextmanager
-def _explained(scenario: Scenario) -> Iterator[None]:
-    """Turn an error of a user's class into a ScenarioError that names the class and the method."""
-    try:
-        yield
-    except (NetkfError, OSError):
-        raise
-    except Exception as error:
-        rule = explain_user_error(scenario, error)
-        if rule is None:
-            raise
-        raise ScenarioError("", rule, None, "correct the class or its settings") from error
+def _class_error(rule: str) -> ScenarioError:
+    return ScenarioError("", rule, None, "correct the class or its settings")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -59,7 +48,7 @@ class Scenario(DerivedScenario):
     """
 
     def __post_init__(self) -> None:
-        with _explained(self):
+        with explained(self, _class_error):
             super().__post_init__()
             check_scenario(self)
 
@@ -93,7 +82,7 @@ class Scenario(DerivedScenario):
     def notes(self) -> tuple[str, ...]:
         """Remarks for the user before a run, one line each, such as unused rows of a table."""
         make = self.node_filter.needs.notes
-        with _explained(self):
+        with explained(self, _class_error):
             notes = () if make is None else tuple(make(self))
         return (
             *self.topology.notes,
