@@ -88,8 +88,6 @@ def _check_values(watched: WatchedPart) -> None:
 
 
 def _check_flags(watched: WatchedPart, name: str, value: Any, kind: type[Any]) -> None:
-    rule = f"must be a {kind.__name__} of netkf.parts"
-    watched.demand(name, isinstance(value, kind), rule, value)
     flags = [field.name for field in dataclasses.fields(kind) if isinstance(field.default, bool)]
     for flag in flags:
         got = getattr(value, flag)

@@ -65,7 +65,7 @@ def make_part(
     part: Any, contracts: tuple[type[Component], ...], settings: Mapping[str, Any]
 ) -> Any:
     """Return ``part``, or ``part(**settings)`` of a class. Raises AssertionError if it is derived
-    from none of the ``contracts``, is abstract or refuses the settings.
+    from none of the ``contracts``, is abstract, refuses the settings or states a wrong value.
     """
     cls = part if isinstance(part, type) else type(part)
     name = cls.__name__
@@ -80,20 +80,15 @@ def make_part(
     demand(not missing, name, f"must define {', '.join(missing)}", remedy="write what is missing")
     if not isinstance(part, type):
         demand(not settings, name, "settings go with a class", sorted(settings), "leave them out")
-        return _with_values(part)
-    try:
-        part = cls(**settings)
-    except ContractError as error:
-        raise AssertionError(str(error)) from None
-    except Exception as error:
-        text = f"could not be made with the settings {dict(settings)!r}"
-        remedy = "hand over an object, or the class with its settings as keywords"
-        fail(name, text, describe_error(error), remedy)
-    return _with_values(part)
-
-
-def _with_values(part: Any) -> Any:
-    """Return ``part``; raises AssertionError for a value of it that its contract does not allow."""
+    else:
+        try:
+            part = cls(**settings)
+        except ContractError as error:
+            raise AssertionError(str(error)) from None
+        except Exception as error:
+            text = f"could not be made with the settings {dict(settings)!r}"
+            remedy = "hand over an object, or the class with its settings as keywords"
+            fail(name, text, describe_error(error), remedy)
     try:
         check_values(part)
     except ScenarioError as error:
