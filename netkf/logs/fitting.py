@@ -369,9 +369,7 @@ class Distances(NamedTuple):
 
 
 def _distances(scenario: Scenario, outcomes: Outcomes, table: pd.DataFrame) -> Distances | None:
-    """Return the distances of the ends of links; None if nodes are nowhere, where their state says,
-    or move while the ``table`` does not say when.
-    """
+    """Return the distances of the ends of links; None if the log does not tell them."""
     places, nodes = scenario.positions, {str(node): node for node in scenario.nodes}
     if places.of_state or not all(places.has(node) for node in nodes.values()):
         return None

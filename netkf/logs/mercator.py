@@ -163,9 +163,7 @@ def _transmissions(table: pd.DataFrame) -> tuple[pd.DataFrame, int]:
 
 
 def _in_turn(low: FloatArray, high: FloatArray, length: FloatArray) -> FloatArray:
-    """Return beginnings between ``low`` and ``high``, the middle where there is room, of bursts of
-    one sender that end before the next one begins where stamps allow it.
-    """
+    """Return the middles of where bursts of one sender can begin so that none overlap."""
     early, late = low.copy(), high.copy()
     for k in range(1, len(low)):
         early[k] = max(low[k], min(early[k - 1] + length[k - 1], high[k]))

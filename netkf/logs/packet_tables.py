@@ -23,6 +23,7 @@ from netkf.logs.packets import (
     parse_numbers,
     parse_stamps,
     read_texts,
+    refuse_rows,
     spread_equal,
     unwrap,
 )
@@ -181,20 +182,17 @@ def _read_rows(path: Path, raw: pd.DataFrame, notes: list[str]) -> _Rows:
             "channel": raw[names["channel"]] if names["channel"] else empty,
         }
     )
-    lost = np.flatnonzero(table["sender"] == "")
-    if lost.size:
-        rule = f"line {raw.index[lost[0]]}: must name a sender"
-        raise ScenarioError(str(path), rule, None, "correct the row")
+    sender, remedy = table["sender"], "correct the row"
+    refuse_rows(path, sender, sender == "", "must name a sender", remedy, quoted=False)
     missing = np.full(len(raw), np.nan)
     for name in ("number", "rssi"):
         column = names[name]
         table[name] = parse_numbers(path, raw, column, gaps=True) if column else missing
     is_count = (table["number"] % 1.0 == 0.0) & table["number"].between(0.0, MAX_ID)
-    wrong = np.flatnonzero(~is_count & table["number"].notna())
-    if wrong.size:
-        rule = f"line {raw.index[wrong[0]]}: number must be an integer from 0 to 2^53"
-        value = raw[names["number"]].iloc[wrong[0]]
-        raise ScenarioError(str(path), rule, value, "correct the entry, or count from less")
+    if names["number"]:
+        rule, remedy = "number must be an integer from 0 to 2^53", "count from less"
+        wrong = ~is_count & table["number"].notna()
+        refuse_rows(path, raw[names["number"]], wrong, rule, f"correct the entry, or {remedy}")
     table["what"], table["heard"] = _read_outcomes(path, raw, names, table)
     stamps, arrivals = parse_stamps(path, raw, names["t"], notes), _read_arrivals(path, raw, names)
     has_receiver = (table["receiver"] != "").to_numpy()
@@ -272,24 +270,19 @@ def _read_outcomes(
         column = raw[names[name]].str.lower()
         groups = [column.isin(group).to_numpy() for group in words]
         is_unknown = column.isin(UNKNOWN).to_numpy()
-        wrong = np.flatnonzero(~(groups[0] | groups[1] | groups[2] | is_unknown))
-        if wrong.size:
-            rule = f"line {raw.index[wrong[0]]}: {names[name]} must say "
-            rule += "what happened (tx, rx or lost)" if name == "event" else "1 or 0"
-            raise ScenarioError(str(path), rule, column.iloc[wrong[0]], "correct the entry")
+        wrong = ~(groups[0] | groups[1] | groups[2] | is_unknown)
+        choices = "what happened (tx, rx or lost)" if name == "event" else "1 or 0"
+        rule = f"{names[name]} must say {choices}"
+        refuse_rows(path, column, wrong, rule, "correct the entry")
         heard = np.select([groups[1], groups[2]], [1.0, 0.0], np.nan)
         if name == "event":
             what[groups[0]] = "tx"
         else:
             what[(table["receiver"] != "").to_numpy()] = "outcome"
-    alone = np.flatnonzero((what != "tx") & (table["receiver"] == "").to_numpy())
-    if alone.size:
-        rule = f"line {raw.index[alone[0]]}: must name a receiver"
-        raise ScenarioError(str(path), rule, None, "correct the row")
-    same = np.flatnonzero((table["receiver"] == table["sender"]).to_numpy())
-    if same.size:
-        rule = f"line {raw.index[same[0]]}: sender and receiver must differ"
-        raise ScenarioError(str(path), rule, table["sender"].iloc[same[0]], "correct the row")
+    sender, receiver, remedy = table["sender"], table["receiver"], "correct the row"
+    alone = (what != "tx") & (receiver == "")
+    refuse_rows(path, receiver, alone, "must name a receiver", remedy, quoted=False)
+    refuse_rows(path, sender, receiver == sender, "sender and receiver must differ", remedy)
     return what, heard
 
 
@@ -344,9 +337,7 @@ def _counts_directions(table: pd.DataFrame) -> bool:
 
 
 def _number_transmissions(table: pd.DataFrame, notes: list[str], log: str) -> pd.Series:
-    """Return a key of the transmission of each row, and add its ``counter`` to the table; raises
-    ScenarioError where numbers make no sense.
-    """
+    """Return a key of each row's transmission, and add its ``counter``; raises ScenarioError."""
     keys = pd.Series(index=table.index, dtype=object)
     table["counter"] = 0
     wraps = restarts = missing = 0
@@ -393,9 +384,7 @@ def _number_transmissions(table: pd.DataFrame, notes: list[str], log: str) -> pd
 
 
 def _align_clocks(table: pd.DataFrame, notes: list[str]) -> None:
-    """Move the stamps of reports, where clocks of nodes are so far apart that numbers of a sender
-    would seem to fall, to the clock of the sender, or of the latest who reports it.
-    """
+    """Move reports to the sender's clock, or the latest, where numbers would seem to fall."""
     reports = table[table["number"].notna() & (table["what"] != "outcome")].sort_values("t")
     who = reports["receiver"].where(reports["what"] != "tx", "")
     moved: list[float] = []
@@ -470,9 +459,7 @@ def _skipped(sends: pd.DataFrame, notes: list[str]) -> pd.DataFrame:
 
 
 def _find_cycle(counters: np.ndarray, channels: list[str]) -> list[str]:
-    """Return the channels over which packets hop in turn, by their counter modulo the length of the
-    list; empty if they hop otherwise.
-    """
+    """Return the channels over which packets hop in turn, by counter; empty if they do not."""
     for length in range(1, min(MAX_CYCLE, len(counters) // 3) + 1):
         found = dict(zip((counters % length).tolist(), channels, strict=True))
         if len(found) == length and channels == [found[c] for c in (counters % length).tolist()]:

@@ -11,6 +11,7 @@ import re
 from dataclasses import dataclass, field
 from decimal import Decimal
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -110,11 +111,18 @@ def parse_numbers(path: Path, table: pd.DataFrame, name: str, gaps: bool = False
     texts = table[name]
     values = np.asarray(pd.to_numeric(texts, errors="coerce"), dtype=float)
     is_gap = np.asarray(texts.str.lower().isin(["", "nan", "none", "na"])) & gaps
-    wrong = np.flatnonzero(~np.isfinite(values) & ~is_gap)
-    if wrong.size:
-        rule = f"line {table.index[wrong[0]]}: {name} must be a number"
-        raise ScenarioError(str(path), rule, texts.iloc[wrong[0]], "correct the entry")
+    wrong, rule = ~np.isfinite(values) & ~is_gap, f"{name} must be a number"
+    refuse_rows(path, texts, wrong, rule, "correct the entry")
     return values
+
+
+def refuse_rows(
+    path: Path, entries: pd.Series, wrong: Any, rule: str, remedy: str, quoted: bool = True
+) -> None:
+    """Raise ScenarioError with the line, and the entry if ``quoted``, of the first wrong row."""
+    for k in np.flatnonzero(wrong)[:1]:
+        value = entries.iloc[k] if quoted else None
+        raise ScenarioError(str(path), f"line {entries.index[k]}: {rule}", value, remedy)
 
 
 def _find_unit(path: Path, table: pd.DataFrame, name: str, notes: list[str] | None) -> str:
@@ -251,9 +259,7 @@ def unwrap(numbers: np.ndarray, times: FloatArray) -> tuple[np.ndarray, int, int
 
 
 def _begin_at(numbers: np.ndarray, first: int | None, modulus: int) -> np.ndarray:
-    """Return the order of rising ``numbers`` of one stamp on a circle, from ``first`` on, or after
-    the widest gap.
-    """
+    """Return the order of rising ``numbers`` on a circle, from ``first`` or the widest gap on."""
     if len(numbers) == 1 or not modulus:
         return np.arange(len(numbers))
     if first is None:

@@ -332,9 +332,7 @@ def _scenario_like(
 
 
 def _begin_with(scenario: Scenario, log: PacketLog) -> None:
-    """Count times from [time] origin of the scenario, and drop what was sent before
-    (ScenarioError).
-    """
+    """Count times from [time] origin, and drop what was sent before; raises ScenarioError."""
     if scenario.time.origin is None or log.is_run:
         return
     origin, sends = scenario.time.stamps.origin, log.sends
@@ -354,9 +352,7 @@ def _begin_with(scenario: Scenario, log: PacketLog) -> None:
 def _recorded_activation(
     scenario: Scenario, log: PacketLog
 ) -> tuple[dict[str, Any], str | Path] | None:
-    """Return the table network.activation that sends as in the log and its file; None if not
-    needed.
-    """
+    """Return the table network.activation that sends as in the log, and its file, if needed."""
     activation, sends = scenario.network.activation, log.sends
     table: dict[str, Any] = {"kind": "recorded", "path": "transmissions.csv"}
     if isinstance(activation, Matching):

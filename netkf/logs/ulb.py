@@ -21,6 +21,7 @@ from netkf.logs.packets import (
     parse_numbers,
     parse_stamps,
     read_texts,
+    refuse_rows,
     spread_equal,
 )
 
@@ -93,9 +94,8 @@ def _read_named(path: Path, names: tuple[str, ...]) -> pd.DataFrame:
         if not column:
             rule = f"must have a column {name}"
             raise ScenarioError(str(path), rule, list(table.columns), "check the file")
-        if name != "t" and (blank := table[column] == "").any():
-            rule = f"line {table.index[blank][0]}: must name a {name}"
-            raise ScenarioError(str(path), rule, None, "correct the row")
+        blank, rule = (table[column] == "") & (name != "t"), f"must name a {name}"
+        refuse_rows(path, table[column], blank, rule, "correct the row", quoted=False)
     return table
 
 
