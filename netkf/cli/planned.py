@@ -131,9 +131,7 @@ def merge_study(plan: Plan, options: argparse.Namespace) -> int:
 
 
 def _merge_again(options: argparse.Namespace, plan: Plan) -> int | None:
-    """Finish a study whose results an earlier merge has written, or a part of them: add what is
-    missing. Return the exit status; None, and nothing happened, if there are no such results.
-    """
+    """Add what results of an earlier merge lack; return the exit status, None if there are none."""
     from netkf.ensembles.parts import Worker
     from netkf.ensembles.planned_study import PlannedStudy
     from netkf.runs.directory_lock import lock_directory
@@ -167,9 +165,7 @@ def _merge_again(options: argparse.Namespace, plan: Plan) -> int | None:
 
 
 def _left_out(folder: Path, new: Path) -> list[str] | None:
-    """Return the files of ``new`` that a ``folder`` of the same results lacks, the last of which
-    says that it is complete; None if it has other results.
-    """
+    """Return the files that a ``folder`` of the results ``new`` lacks; None if it has others."""
     from netkf.runs.documents import FINAL_STATUSES, DamagedError, read_document
 
     names = [str(file.relative_to(new)) for file in new.rglob("*") if file.is_file()]
@@ -178,7 +174,7 @@ def _left_out(folder: Path, new: Path) -> list[str] | None:
         if other == ["manifest.json"]:
             unfinished = read_document(folder / other[0]).get("status") not in FINAL_STATUSES
             other, missing = ([], missing + other) if unfinished else (other, missing)
-    missing.sort(key=lambda name: name in ("manifest.json", "verdict.json"))
+    missing.sort(key=lambda name: name in ("manifest.json", "verdict.json"))  # last: complete
     return missing if "scenario.toml" in same and not other else None
 
 

@@ -119,9 +119,7 @@ def block_statistics(
 def _batches(
     scenario: Scenario, seed: int, replicas: range, engine: Engine, traces: int
 ) -> Iterator[tuple[RunBatch, FloatArray | None, tuple[Trace, ...]]]:
-    """Yield batches of the runs of ``replicas``, simulated with ``seed``, with the quantities of
-    their networks and their traces.
-    """
+    """Yield batches of the runs of ``replicas``, with quantities of networks, and with traces."""
     for replica in range(replicas.start, min(traces, replicas.stop)):
         memory = MemorySink()
         batch, network, recorder = _recorded_run(scenario, seed, replica, engine, memory)

@@ -109,9 +109,7 @@ def match_messages(log: IntArray, swaps: bool, slotted: bool) -> Messages:
 
 
 def _next_use(log: IntArray, rows: IntArray) -> IntArray:
-    """Return the rows (K,) at which nodes use arrivals at ``rows``, or go down before they do;
-    NEVER without one.
-    """
+    """Return the rows (K,) at which nodes use arrivals at ``rows``, or go down; NEVER without."""
     # One sorted search for all nodes: keys order the uses by node, then by row of the log. The
     # result may be a use by the following node, which the last line rejects.
     uses = np.flatnonzero(np.isin(log["kind"], [CODES[kind] for kind in ENDS]))

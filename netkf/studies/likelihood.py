@@ -400,9 +400,7 @@ def _hessian(loss: Callable[[FloatArray], float], theta: FloatArray) -> FloatArr
 def _deviations(
     value: Callable[[FloatArray], float], factors: FloatArray, free: np.ndarray
 ) -> FloatArray:
-    """Return standard errors (J,) of logarithms of factors, nan for those that are not ``free`` or
-    that readings do not tell, as two that act alike.
-    """
+    """Return standard errors (J,) of logarithms of ``free`` factors, nan if readings are silent."""
 
     def loss(theta: FloatArray) -> float:
         whole = factors.copy()

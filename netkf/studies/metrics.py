@@ -191,9 +191,7 @@ def central_trace(scenario: Scenario) -> float:
 
 
 def _require_fixed_H(scenario: Scenario) -> None:
-    """Raise TheoryError if readings are recorded or missing, H is random or the dynamics are not
-    linear.
-    """
+    """Raise TheoryError unless the dynamics are linear, and all readings drawn with a known H."""
     _ = scenario.linear_plant
     require_every_reading(scenario)
     if not scenario.is_random:
