@@ -492,9 +492,7 @@ class BeliefPropagation(Filter):
             )
 
     def _scenario_notes(self, scenario: Any) -> tuple[str, ...]:
-        """Return a note for the user where the graph of a ``netkf.Scenario`` has loops, on which P
-        is too small; else nothing.
-        """
+        """Return a note where the graph of a ``netkf.Scenario`` has loops: P is too small."""
         if is_forest(scenario):
             return ()
         return (

@@ -458,9 +458,7 @@ class ConsensusInnovations(Filter):
         )
 
     def _scenario_notes(self, scenario: Any) -> tuple[str, ...]:
-        """Return a note for the user where messages of a ``netkf.Scenario`` may be lost, or held
-        back by a trigger, which makes P too small; else nothing.
-        """
+        """Return a note where messages may be lost or held back, which makes P too small."""
         if scenario.delivers_all and scenario.filter.algorithm is self:
             return ()
         return (

@@ -607,10 +607,7 @@ class PushSum(Filter):
         )
 
     def _check_scenario(self, scenario: Any) -> None:
-        """Raise ScenarioError where the settings do not fit a ``netkf.Scenario`` in slots: the
-        leader is no node, gamma or delta is missing or averaging would not contract, rounding of
-        information would take the first covariance, or P_inf does not exist.
-        """
+        """Raise ScenarioError where the settings do not fit a ``netkf.Scenario`` in slots."""
         if not scenario.slotted:
             return
         nodes = scenario.nodes
@@ -660,9 +657,7 @@ class PushSum(Filter):
             )
 
     def _scenario_notes(self, scenario: Any) -> tuple[str, ...]:
-        """Return one line each: delta is below rho(L); rounding of information; settings of slots
-        are not used under clocks.
-        """
+        """Return notes on delta, on rounding, and on settings that clocks do not use."""
         if not scenario.slotted:
             fields = dataclasses.fields(self)
             changed_settings = [

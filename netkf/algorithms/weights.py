@@ -18,9 +18,7 @@ METROPOLIS = "metropolis"
 
 
 def _check_columns(weights: FloatArray) -> None:
-    """Raise ScenarioError unless the ``weights`` (N, N) of N nodes are not negative and each
-    column sums to 1: entry [l, i] is the weight that node i gives to node l, itself included.
-    """
+    """Raise ScenarioError unless ``weights`` (N, N) are not negative and columns sum to 1."""
     if (weights < 0.0).any():
         # Weights come from files: the message names the entry.
         where = np.argwhere(weights < 0.0)[0].tolist()

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.core.errors import ScenarioError, errors_under, quote
+from netkf.core.errors import ScenarioError, quote
 from netkf.core.fields import Component, boolean, number, stated
 from netkf.core.laws import EXPONENTIAL, Lattice, WaitingLaw
 from netkf.linalg.arrays import FloatArray
@@ -98,8 +98,7 @@ def stated_rate(clock: Clock, entity: Entity, key: str) -> float:
     """Return ``clock.mean_rate``; ScenarioError at ``key`` unless it is at least 0 or nan."""
     rate: Any = clock.mean_rate(entity)
     if not (isinstance(rate, float) and (rate >= 0.0 or math.isnan(rate))):
-        with errors_under(key):
-            rate = float(number(low=0.0)(f"{type(clock).__name__}.mean_rate", rate))
+        rate = number(low=0.0)(f"{key}.{type(clock).__name__}.mean_rate", rate)
     return float(rate)
 
 

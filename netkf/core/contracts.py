@@ -284,14 +284,14 @@ def _watched(cls: type, own: FunctionType, contract: FunctionType) -> Any:
         except SystemExit as error:  # it would end the command without a word
             raise ContractError(f"{describe_method(cls, own)} called exit") from error
         _Last.call = Call(cls, own, result)
+        rule = ""
         if result is None and not is_optional:
             rule = "returned nothing; it must return a value"
-            raise ContractError(f"{describe_method(cls, own)} {rule}")
-        if length and not (isinstance(result, tuple) and len(result) == length):
+        elif length and not (isinstance(result, tuple) and len(result) == length):
             rule = f"must return a tuple of {length}, not {quote(result)}"
-            raise ContractError(f"{describe_method(cls, own)} {rule}")
-        if length and result[0] is None:
+        elif length and result[0] is None:
             rule = f"must return a value before the others, not {quote(result)}"
+        if rule:
             raise ContractError(f"{describe_method(cls, own)} {rule}")
         return result
 

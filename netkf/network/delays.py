@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.core.errors import ScenarioError, errors_under
+from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     Component,
     Rule,
@@ -30,8 +30,7 @@ from netkf.network.losses import Transmission
 _SECONDS = number(low=0.0)
 
 
-def _is_none(value: object) -> bool:
-    return value is None
+_NONE, _FOREVER = Rule("must be None", lambda value: value), Rule("must be inf", float)
 
 
 def _is_infinite(value: object) -> bool:
@@ -45,8 +44,8 @@ class Delay(Component):
     _called_if = MappingProxyType({"draw": "is_random"})
     _values = MappingProxyType(
         {
-            "fixed": either(_SECONDS, Rule("must be None", lambda value: value), _is_none),
-            "longest": either(_SECONDS, Rule("must be inf", float), _is_infinite),
+            "fixed": either(_SECONDS, _NONE, lambda value: value is None),
+            "longest": either(_SECONDS, _FOREVER, _is_infinite),
             "is_random": boolean,
             "law": stated(WaitingLaw, optional=True),
         }
@@ -192,8 +191,7 @@ def draw_delay(delay: Delay, random: np.random.Generator) -> float:
     """Return ``delay.draw`` in seconds; raises ScenarioError unless it is at least 0."""
     seconds: Any = delay.draw(random)
     if not (isinstance(seconds, float) and seconds >= 0.0):
-        with errors_under("network.channel.delay"):
-            seconds = float(_SECONDS(f"{type(delay).__name__}.draw", seconds))
+        seconds = _SECONDS(f"network.channel.delay.{type(delay).__name__}.draw", seconds)
     return float(seconds)
 
 
@@ -206,13 +204,12 @@ def checked_delay(delay: Delay, sent: Transmission, drawn: float) -> float:
     """Return the seconds that ``sent`` takes, nan if lost; raises ScenarioError if negative."""
     seconds: Any = delay.message_delay(sent, drawn)
     if not isinstance(seconds, float):  # a float32 would make times of its precision
-        with errors_under("network.channel.delay"):
-            seconds = float(number()(f"{type(delay).__name__}.message_delay", seconds))
+        name = f"{type(delay).__name__}.message_delay"
+        seconds = number()(f"network.channel.delay.{name}", seconds)
     if seconds < 0.0:
         rule = (
             f"{type(delay).__name__}: the delay of message {sent.number} on link "
-            f"{list(sent.link)} must "
-            "not be negative"
+            f"{list(sent.link)} must not be negative"
         )
         remedy = "correct message_delay of the class"
         raise ScenarioError("network.channel.delay", rule, seconds, remedy)

@@ -16,7 +16,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from netkf.core.csv_files import read_columns
-from netkf.core.errors import ScenarioError, errors_under, quote
+from netkf.core.errors import ScenarioError, quote
 from netkf.core.fields import (
     Component,
     Rule,
@@ -589,8 +589,8 @@ def stated_delivery(loss: Loss, sent: Transmission) -> float:
     mean: Any = loss.mean_delivery(sent)
     if isinstance(mean, float) and math.isnan(mean):
         return math.nan
-    with errors_under("network.channel.loss"):
-        return float(probability(f"{type(loss).__name__}.mean_delivery", mean))
+    name = f"{type(loss).__name__}.mean_delivery"
+    return float(probability(f"network.channel.loss.{name}", mean))
 
 
 def delivery_probabilities(loss: Loss, sent: Transmission) -> FloatArray:

@@ -264,13 +264,9 @@ def _result_of(
         return np.asarray(getattr(sensor, method)(x, node), dtype=np.float64)
     given = getattr(sensor, method)(x.copy(), node)
     result = np.asarray(given)
-    is_finite = result.dtype.kind in "fiu" and bool(np.isfinite(result).all())
+    is_right = result.dtype.kind in "fiu" and result.shape == shape
     # Of a state that has left the numbers nobody can know the reading.
-    if (
-        result.dtype.kind not in "fiu"
-        or result.shape != shape
-        or (not is_finite and np.isfinite(x).all())
-    ):
+    if not is_right or (np.isfinite(x).all() and not np.isfinite(result).all()):
         rule = f"{method} must return finite numbers of the shape {shape}, not {quote(given)}"
         raise ValueError(f"{rule}, at x = {quote(x)}")
     return result.astype(np.float64)

@@ -178,9 +178,7 @@ class DiffusionPaths:
         return block if self._forcing is None else self._forced(block)
 
     def _forced(self, block: StepBlock) -> StepBlock:
-        """Return the block with the response to an input, whose course inside a piece is
-        approximated as that of the noise is.
-        """
+        """Return the block with the response to an input, approximated as noise is in a piece."""
         laws, snap = self.laws, self.laws.time_grid.snap
         start, pieces = self._forcing.over_pieces(block.start, block.end, laws.time_grid)
         gaps, index = np.unique(snap(block.end - block.start), return_inverse=True)

@@ -183,9 +183,7 @@ class SlotNode(Node):
             self._close(stage, slot)
 
     def _follow(self, slot: int) -> None:
-        """Let a model that changes go to the piece of a slot, or to that of the slot before if that
-        is from where a slot is predicted.
-        """
+        """Let a model that changes go to the piece of the slot from which it predicts."""
         if isinstance(self.moving_model, ChangingSlotModel):
             self.moving_model.move_to(slot if self._timing.predicts else slot - 1)
 

@@ -214,9 +214,7 @@ class Transmitter:
         return self._encoded[sender][1]
 
     def _stamped_age(self, link: Link, sent: float, age: float) -> float:
-        """Return the age that the stamp of a message tells its receiver, whose filter believes it:
-        from 0 to the time since the start, both by the receiver's clock.
-        """
+        """Return the age that its stamp tells the receiver, from 0 to the time since the start."""
         if not self._clocks:
             return age
         (sender, receiver), now = (self._clocks[node] for node in link), self._timeline.now
