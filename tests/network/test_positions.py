@@ -484,7 +484,7 @@ REFUSED = {
     ),
     "plants[0].position: cannot be that of a block that all nodes share": lambda folder: scenario(
         folder, sensors=[],
-        plants=[{"name": "all", "A": [[0.0]], "B": [[1.0]], "position": [0]}],
+        plants=[{"name": "team", "A": [[0.0]], "B": [[1.0]], "position": [0]}],
     ),
     "plant.position: is not a key here": lambda folder: scenario(
         folder, plant=FLOW | {"position": [0]}

@@ -156,7 +156,7 @@ def test_recorded_linear_blocks_are_one_recorded_plant(tmp_path):
         ({"plants.1.unknown": True, "plants.1.path": "truth.csv"}, r"plants\[1\].path: means not"),
         ({"plants.1.interpolate": "hold"}, r"plants\[1\].interpolate: means nothing without path"),
         (
-            {"plants": [{"name": "all", "A": [[0.0]], "B": [[1.0]], "input": RECORDED}]},
+            {"plants": [{"name": "team", "A": [[0.0]], "B": [[1.0]], "input": RECORDED}]},
             r"plants\[0\].input.path: odometry.csv has a column node",
         ),
     ],

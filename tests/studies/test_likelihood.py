@@ -158,16 +158,16 @@ def test_a_variance_that_readings_deny_is_zero(tmp_path):
 def test_blocks_of_one_name_share_a_variance(tmp_path):
     plants = [
         {"name": "walk", "nodes": [0, 1], "kind": "diffusion", "A": [[0.0]], "B": [[0.5]]},
-        {"name": "all", "kind": "diffusion", "A": [[-0.1]], "B": [[1.0]]},
+        {"name": "team", "kind": "diffusion", "A": [[-0.1]], "B": [[1.0]]},
     ]
     clock = {"kind": "periodic", "period": 0.5}
     sensors = [
         {"nodes": [0, 1], "of": "walk", "H": [[1.0]], "R": [[0.2]], "sampling": clock},
-        {"nodes": [0], "of": "all", "H": [[1.0]], "R": [[0.1]], "sampling": clock},
+        {"nodes": [0], "of": "team", "H": [[1.0]], "R": [[0.1]], "sampling": clock},
     ]
     given = scenario(tmp_path, None, {}, 80.0, plants=plants, sensors=sensors)
     found = fit_noise(given, seed=3, confidence=0.999)
-    names = ["walk: |B[:, 0]|^2", "all: |B[:, 0]|^2", "sensors[0].R[0][0]", "sensors[1].R[0][0]"]
+    names = ["walk: |B[:, 0]|^2", "team: |B[:, 0]|^2", "sensors[0].R[0][0]", "sensors[1].R[0][0]"]
     assert found.table["name"].tolist() == names
     assert (found.table["low"] < [0.25, 1.0, 0.2, 0.1]).all()
     assert (found.table["high"] > [0.25, 1.0, 0.2, 0.1]).all()
