@@ -173,10 +173,8 @@ def _bound_approaches_limit(samples: HybridSamples, level: float) -> Finding:
 
 
 def _constant_gains_are_worse(samples: HybridSamples, level: float) -> Finding:
-    promised, times = (
-        with_promised_filter(samples.scenario),
-        np.array(check_times(samples.scenario)),
-    )
+    promised = with_promised_filter(samples.scenario)
+    times = np.array(check_times(samples.scenario))
     time_varying, constant = covariance_bound(promised, times), constant_gain_bound(promised, times)
     size = np.trace(time_varying, axis1=-2, axis2=-1)
     smallest_eigenvalue = np.linalg.eigvalsh(constant - time_varying)[..., 0] / np.maximum(

@@ -78,10 +78,8 @@ def is_finished(out: Path | None, scenario: Scenario, plan: RunIdentity) -> bool
     }
     for key, (planned, remedy) in requirements.items():
         if manifest.get(key) != planned:
-            rule, stored = (
-                f"{out} holds a run of another {key.removesuffix('s')}",
-                manifest.get(key),
-            )
+            rule = f"{out} holds a run of another {key.removesuffix('s')}"
+            stored = manifest.get(key)
             if isinstance(stored, dict) and isinstance(planned, dict):
                 names = [k for k in {**stored, **planned} if stored.get(k) != planned.get(k)]
                 stored = {name: stored.get(name) for name in names}

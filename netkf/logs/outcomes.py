@@ -130,14 +130,9 @@ class Outcomes:
     @cached_property
     def by_channel(self) -> np.ndarray:
         """``counts`` for each channel, (C, L, 2)."""
-        return np.stack(
-            [
-                self._sum(
-                    tuple(g for g, c in zip(self.groups, self.channels, strict=True) if c == n)
-                )
-                for n in self.channel_names
-            ]
-        )
+        pairs = list(zip(self.groups, self.channels, strict=True))
+        names = self.channel_names
+        return np.stack([self._sum(tuple(g for g, c in pairs if c == name)) for name in names])
 
 
 def make_outcomes(table: pd.DataFrame) -> Outcomes:

@@ -375,10 +375,8 @@ class RecordedReadings:
             row = 0
             for k in self._slots.get(slot, ()):
                 values, matrix = self._whitened[k]
-                y[index, row : row + len(values)], H[index, row : row + len(values)] = (
-                    values,
-                    matrix,
-                )
+                y[index, row : row + len(values)] = values
+                H[index, row : row + len(values)] = matrix
                 row += len(values)
         return y, H
 

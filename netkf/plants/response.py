@@ -145,11 +145,9 @@ class FlowResponse:
         # exp([[M, I, 0], [0, 0, I], [0, 0, 0]] g) has the integrals of e^{M s} and of (g - s) e^{M
         # s} over the gap g in its first row of blocks.
         nested = np.zeros((3 * N, 3 * N))
-        nested[:N, :N], nested[:N, N : 2 * N], nested[N : 2 * N, 2 * N :] = (
-            joint,
-            np.eye(N),
-            np.eye(N),
-        )
+        nested[:N, :N] = joint
+        nested[:N, N : 2 * N] = np.eye(N)
+        nested[N : 2 * N, 2 * N :] = np.eye(N)
         moves = Transitions(nested, np.zeros((3 * N, 1))).transitions(gaps)[:, :n]
         ends, plain, tail = (apply(moves[..., k * N : (k + 1) * N], w) for k in range(3))
         # P_1 = 2 s / g - 1, and s = g - (g - s).

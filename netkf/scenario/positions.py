@@ -120,10 +120,8 @@ def tick_times(scenario: Any, streams: Streams) -> FloatArray:
 def ticks_of(scenario: Any, streams: Streams, entity: tuple[int, ...]) -> FloatArray:
     """Return the instants (K,), in seconds, at which the clock of an ``entity`` ticks."""
     clock = scenario.network.activation
-    phase, random = (
-        partial(streams.generator, "phase", *entity),
-        streams.generator("clock", *entity),
-    )
+    phase = partial(streams.generator, "phase", *entity)
+    random = streams.generator("clock", *entity)
     own = node_time(scenario, streams, owner_of(clock, entity))
     ahead = own.ahead(clock)
     until = own.until(scenario.horizon, ahead)

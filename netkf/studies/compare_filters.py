@@ -321,10 +321,8 @@ def _make_candidate(scenario: Scenario, choice: Choice, engine: str) -> FilterEn
         settings = (
             {} if isinstance(choice, str) else {k: v for k, v in choice.items() if k != "kind"}
         )
-        label, make = (
-            _make_label(str(table["kind"]), settings),
-            partial(scenario.replace, {"filter": table}),
-        )
+        label = _make_label(str(table["kind"]), settings)
+        make = partial(scenario.replace, {"filter": table})
     try:
         candidate = make()
         choose_engine(engine, candidate, announce=False)

@@ -240,10 +240,8 @@ def _check_delivery_probabilities(watched: WatchedPart, one: Transmission) -> No
                 subject = f"at the distance {distance:g}"
             rule = f"must be a number from 0 to 1 {subject}"
             watched.demand(method, known and 0.0 <= probability <= 1.0, rule, probability)
-            rule, remedy = (
-                "must be 0 or 1 where the loss is deterministic",
-                "let deterministic be False",
-            )
+            rule = "must be 0 or 1 where the loss is deterministic"
+            remedy = "let deterministic be False"
             is_sure = not part.deterministic or probability in (0.0, 1.0)
             watched.demand(method, is_sure, rule, probability, remedy)
     mean = watched.call("mean_delivery", one)
@@ -373,10 +371,8 @@ def _check_message_delays(watched: WatchedPart, links: tuple[Link, ...]) -> None
     for (link, message, *_), seconds in zip(calls, delays, strict=True):
         subject = f"message {message} of link {list(link)}"
         watched.demand(method, is_number(seconds), f"must be a number for {subject}", seconds)
-        in_range, got = (
-            math.isnan(seconds) or 0.0 <= seconds <= longest,
-            f"{seconds:g} for {subject}",
-        )
+        in_range = math.isnan(seconds) or 0.0 <= seconds <= longest
+        got = f"{seconds:g} for {subject}"
         rule = f"must be from 0 to `longest` ({longest:g}) seconds, or nan where it is lost"
         watched.demand(method, in_range, rule, got)
         is_fixed = part.fixed is None or seconds == drawn_delay or overrides_message_delay(part)

@@ -53,11 +53,9 @@ class ClockColumns(LoggedColumns):
     """The errors of M estimators under clocks; the first n rows of the forms are the true state."""
 
     def __init__(self, scenario: Scenario, run: Run) -> None:
-        self._scenario, self._run, self._log = (
-            scenario,
-            run,
-            [run.log[name].tolist() for name in ("t", "kind", "node", "peer", "message")],
-        )
+        self._scenario = scenario
+        self._run = run
+        self._log = [run.log[name].tolist() for name in ("t", "kind", "node", "peer", "message")]
         self._forms_of_all = forms = Forms(scenario.plant.n * (len(scenario.nodes) + 1))
         plant = cast(Any, scenario.plant)
         self.n = plant.n

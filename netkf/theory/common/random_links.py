@@ -281,10 +281,8 @@ def poisson_ticks(
     assert isinstance(clock, LinkClock)
     if clock.at == "readings" or not clock.memoryless:
         raise TheoryError("nodes do not transmit by Poisson clocks of their own")
-    entities, index = (
-        clock.entities(scenario.topology),
-        {direction: k for k, direction in enumerate(links)},
-    )
+    entities = clock.entities(scenario.topology)
+    index = {direction: k for k, direction in enumerate(links)}
     ticks = []
     for entity in entities:
         if clock.at == "nodes":

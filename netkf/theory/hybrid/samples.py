@@ -127,10 +127,8 @@ def poisson_samples(scenario: Scenario) -> tuple[PoissonSamples, ...]:
         sensor = scenario.sensors[placed_sensor.entry]
         clock = sampling_clock(sensor)
         assert clock is not None
-        rate, R = (
-            clock.mean_rate((node, placed_sensor.ordinal)),
-            scenario.noise_covariance(placed_sensor.entry, believed=True),
-        )
+        rate = clock.mean_rate((node, placed_sensor.ordinal))
+        R = scenario.noise_covariance(placed_sensor.entry, believed=True)
         # All nodes have the covariance of a pooled filter, which uses the readings of each.
         for reader in range(size) if pooled else [index[node]]:
             entry = (reader, np.asarray(sensor.H), R, rate, index[node])

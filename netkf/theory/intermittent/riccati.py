@@ -459,10 +459,8 @@ def couple_from_the_past(
         distance = np.abs(covariances[0] - covariances[1]).max(axis=(-1, -2))
         # Chains that met are finished; the others need a longer past.
         met = distance <= COALESCENCE_TOLERANCE * np.abs(covariances[0]).max(axis=(-1, -2))
-        out[open_chains[met]], last[open_chains[met]] = (
-            symmetric(covariances[0, met]),
-            modes[met, -1],
-        )
+        out[open_chains[met]] = symmetric(covariances[0, met])
+        last[open_chains[met]] = modes[met, -1]
         open_chains, modes = open_chains[~met], modes[~met]
         if 2 * modes.shape[1] > MAX_PAST:
             break

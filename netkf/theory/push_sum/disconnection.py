@@ -311,10 +311,8 @@ def _estimate(
     nodes: int, probabilities: dict[tuple[int, int], float], seed: int, samples: int
 ) -> Probability:
     """Return the share of ``samples`` draws that are disconnected, with Clopper-Pearson ends."""
-    edges, edge_probabilities = (
-        np.array(list(probabilities)),
-        np.array(list(probabilities.values())),
-    )
+    edges = np.array(list(probabilities))
+    edge_probabilities = np.array(list(probabilities.values()))
     random, cut, draws_done = Streams(seed).generator("links"), 0, 0
     # The links of each node, one node after the other: all are in some link.
     ends = np.argsort(edges.ravel(), kind="stable")
