@@ -117,13 +117,20 @@ def draw_network(
         positions = get_positions(data.scenario, data.run)
     _draw_links(axes, data, positions)
     dots = _draw_nodes(axes, data, positions, values)
-    # Labels are placed, in points, just outside the marker, whose side or diameter is sqrt(area).
+    # Labels are placed, in points, just outside the marker, whose side or diameter is sqrt(area),
+    # at the rim of the network on the side away from its middle, where no links are.
     distance = 1.0 + 0.5 * math.sqrt(_dot_area(data))
-    if len(data.nodes) <= MAX_LABELLED_NODES:
-        for node in data.nodes:
-            style: dict[str, Any] = {"fontsize": 6.5, "color": MUTED, "zorder": 3}
-            offset: dict[str, Any] = {"xytext": (distance,) * 2, "textcoords": "offset points"}
-            axes.annotate(plain(node), positions[node], **offset, **style)
+    middle = [sum(axis) / len(positions) for axis in zip(*positions.values(), strict=True)]
+    rim = 0.9 * max(math.dist(place, middle) for place in positions.values())
+    for node in data.nodes if len(data.nodes) <= MAX_LABELLED_NODES else ():
+        at_rim = math.dist(positions[node], middle) >= rim
+        left, below = (
+            at_rim and p < m - 1e-9 for p, m in zip(positions[node], middle, strict=True)
+        )
+        style: dict[str, Any] = {"fontsize": 6.5, "color": MUTED, "zorder": 3}
+        style |= {"ha": "right" if left else "left", "va": "top" if below else "baseline"}
+        offset = (-distance if left else distance, -distance if below else distance)
+        axes.annotate(plain(node), positions[node], offset, textcoords="offset points", **style)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.13)
     axes.axis("off")

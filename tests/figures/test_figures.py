@@ -327,3 +327,15 @@ def test_the_plane_needs_nodes_that_estimate_their_coordinates(drawing):
         assert words in " ".join(
             " ".join(t for t, _ in shown_texts(drawing(kind).draw("plane"))).split()
         )
+
+
+def test_the_names_of_nodes_on_a_circle_stand_outside_of_it():
+    """Inside they would lie on the links."""
+    changes = {"horizon": 1.0, "network.graph": {"kind": "complete", "nodes": 9}}
+    changes["filter.epsilon"] = 0.1
+    figure = netkf.simulate(netkf.load(SCENARIOS / "poisson_ring.toml", changes)).plot("network")
+    figure.canvas.draw()
+    axes = next(axes for axes in figure.axes if len(axes.texts) >= 9)
+    for text in axes.texts[:9]:
+        box = text.get_window_extent().transformed(axes.transData.inverted())
+        assert np.hypot(*np.mean([box.min, box.max], axis=0)) > np.hypot(*text.xy)
