@@ -309,7 +309,7 @@ class Why:
                 f"{limit}): {named}{fewer} ({tried})."
             )
         elif smallest.messages is not None:
-            yield f"No message had to come: trace P as it was is at most {limit}."
+            yield f"No message was needed: trace P as it was is already at most {limit}."
         elif smallest.proven:
             most = f"{smallest.most} messages or fewer"
             yield f"No {most} would have brought it to {limit} ({tried})."

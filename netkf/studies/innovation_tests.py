@@ -349,7 +349,7 @@ def format_innovations(tests: InnovationTests, full: bool = True) -> str:
             str(row.node),
             f"{row.readings:,}",
             format_number(row.nis),
-            f"{format_number(row.bias)} +- {row.bias_reach:.2g}",
+            format_number(row.bias) + f" +- {row.bias_reach:.2g}" * math.isfinite(row.bias_reach),
             *[row.label or f"y{row.component}"] * named,
             format_number(row.p_white),
             f"{row.log_likelihood:.6g}",
@@ -367,12 +367,14 @@ def format_innovations(tests: InnovationTests, full: bool = True) -> str:
     }
     lines = [format_table(header, rows if full else shorten_rows(rows, MAX_ROWS)), ""]
     lines.append(f"{words[tests.law.kind]}; all together at confidence {tests.confidence:g}")
-    if tests.law.kind:
-        largest = [max(getattr(row, name) for row in tests.rows) for name in DETECTABLE]
-        text = "found with probability 0.9 at every node: a mean NIS of {:.3g}, a bias of {}"
+    # Where readings are too few nothing can be found.
+    judged = [row for row in tests.rows if math.isfinite(row.nis_detectable + row.bias_detectable)]
+    if tests.law.kind and judged:
+        largest = [max(getattr(row, name) for row in judged) for name in DETECTABLE]
+        text = "found with probability 0.9 at every node judged: a mean NIS of {:.3g}, a bias of {}"
         text += ", a correlation at one lag of {:.3g}" * (tests.law.kind == "white")
         # Biases of different units do not compare.
-        found = sorted((row.label, row.bias_detectable) for row in tests.rows)
+        found = sorted((row.label, row.bias_detectable) for row in judged)
         largest[1] = ", ".join(f"{b:.3g}" + f" in {of}" * bool(of) for of, b in dict(found).items())
         lines.append(text.format(*largest))
     return "\n".join(lines)

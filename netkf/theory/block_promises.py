@@ -63,7 +63,7 @@ def central_at_horizon(scenario: Scenario) -> FloatArray:
     if scenario.increment_sensors:
         raise TheoryError("samples beside increments: the least error covariance is not computed")
     for node, _ in randomly_sampled_sensors(scenario):
-        raise TheoryError(f"node {node} samples at random times: it is that of the times of a run")
+        raise TheoryError(f"node {node} samples at random times: every run has its own")
     central = scenario.replace({"filter": {"kind": "central"}})
     plant, P, now, piece = scenario.diffusion, scenario.plant.start_cov, 0.0, 0
     changes = plant.changes[plant.changes < scenario.horizon].tolist()

@@ -321,3 +321,20 @@ def test_the_command_says_which_node(capsys):
     # Mote 9 reads .6 degrees less than the others.
     assert min(rows, key=lambda row: row["bias"])["node"] == 9
     assert main(["innovations", path, "--set", "sensors=[]"]) == 2
+
+
+def test_a_node_with_too_few_readings_does_not_hide_what_others_would_show(tmp_path):
+    """No infinity is printed: neither beside its bias nor as what is found at all nodes."""
+    table = {**WALK, "filter": {"kind": "hybrid", "epsilon": 0.3}}
+    network = {**WALK["network"], "activation": {"kind": "poisson", "rate": 1.0}}
+    scenario = from_table({**table, "network": network}, tmp_path)
+    for readings, last in ((120, "found with"), (2, "if the model")):
+        recorded = drawn(np.random.default_rng(3), readings, nodes=3)
+        kept = np.flatnonzero((recorded.nodes != 2) | (recorded.times < 3.0))
+        lists = [[values[k] for k in kept] for values in recorded[4:7]]
+        arrays = [values[kept] for values in (*recorded[:4], recorded[7])]
+        fewer = Innovations(*arrays[:4], *lists, arrays[4])
+        shown = format_innovations(judge_innovations(scenario, fewer, 0.99))
+        assert "not judged: too few" in shown
+        assert "inf" not in shown
+        assert shown.splitlines()[-1].startswith(last)

@@ -135,7 +135,7 @@ def central_covariance(scenario: Scenario) -> FloatArray:
         return _central_slot_covariance(scenario)
     if scenario.sampled_sensors:
         raise TheoryError(
-            "sampled sensors: the central covariance goes up and down with the samples"
+            "no steady value: with sampled sensors it goes up and down with the samples"
         )
     G = np.zeros((scenario.plant.n, scenario.plant.n))
     for node in scenario.sensing_nodes:
