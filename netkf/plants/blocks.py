@@ -181,17 +181,10 @@ class Layout:
         return whole
 
 
-CHOICES = ("all", "own", "own+neighbours", "shared")
-"""Words of ``filter.estimates``, which names of blocks must not be."""
-
-
 def _places(blocks: Sequence[Block]) -> Iterator[Place]:
     first, seen = 0, set[tuple[str, int | None]]()
     names = [block.name for block in blocks]
     for k, block in enumerate(blocks):
-        if block.name in CHOICES:
-            rule = "must be no word of filter.estimates"
-            raise ScenarioError(f"[{k}].name", rule, block.name, "give the block another name")
         others = [one for one in blocks if one.name == block.name]
         if len(others) > 1 and any(one.nodes is None for one in others):
             rule = "must be unique, or all entries of that name must have nodes"

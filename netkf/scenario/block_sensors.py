@@ -12,7 +12,7 @@ from netkf.core.errors import ScenarioError, errors_under, suggest_nearest
 from netkf.core.places import Place
 from netkf.core.printable import list_some
 from netkf.network.graphs import Topology
-from netkf.plants.blocks import CHOICES, Layout
+from netkf.plants.blocks import Layout
 from netkf.plants.nonlinear import PositionedSensor
 from netkf.plants.recorded import RecordedSensor
 from netkf.plants.relative import RelativePositionSensor, RelativeSensor
@@ -85,6 +85,9 @@ def unheard_notes(scenario: Any) -> tuple[str, ...]:
     return tuple(notes)
 
 
+CHOICES = ("all", "own", "own+neighbours", "shared")
+
+
 def estimated_blocks(
     estimates: str | tuple[str, ...], layout: Layout, topology: Topology
 ) -> tuple[tuple[Place, ...], ...]:
@@ -115,6 +118,10 @@ def estimated_blocks(
                 for name in dict.fromkeys(names)
                 if name not in layout.names or layout.find(name, node) is not None
             )
+        named = layout.find(str(estimates), node) if estimates in CHOICES[1:] else None
+        if named is not None and own != (named,):
+            rule = "is a word for other blocks than the one of that name"
+            raise ScenarioError("", rule, estimates, f'write ["{estimates}"], or name it otherwise')
         if not own:
             rule = f"must give every node a block, and node {node} has none"
             raise ScenarioError("", rule, estimates, "give it one in [[plants]], or choose others")
