@@ -205,3 +205,10 @@ def test_many_runs_together(tmp_path: Path, kind: str) -> None:
     )
     for name in ("mean_P", "mean_nees"):
         np.testing.assert_allclose(getattr(fast, name), getattr(slow, name), rtol=1e-10)
+
+
+def test_a_block_named_like_a_choice_of_estimates(tmp_path: Path) -> None:
+    own = load(POSES.replace('"pose"', '"shared"'), tmp_path)
+    with pytest.raises(netkf.ScenarioError, match=r"filter.estimates: is a word for other blocks"):
+        own.replace({"filter.estimates": "shared"})
+    assert own.replace({"filter.estimates": ["shared"]}).estimated == own.estimated

@@ -484,13 +484,3 @@ def test_nodes_move_their_own_blocks_by_their_own_dynamics(tmp_path: Path) -> No
         load(UNICYCLES, tmp_path, {"plants.0.coupling": [{"from": [2], "A": [[1.0]]}]})
     with pytest.raises(netkf.ScenarioError, match=r"plants\[0\].input: must have 2 components"):
         load(UNICYCLES, tmp_path, {"plants.0.input": {"kind": "constant", "value": [1.0]}})
-
-
-def test_a_block_named_like_a_choice_of_estimates(tmp_path: Path) -> None:
-    named = ROBOTS.replace('"pose"', '"shared"')
-    own = load(named, tmp_path).replace(
-        {"filter": {"kind": "block-intersection", "estimates": "own"}}
-    )
-    with pytest.raises(netkf.ScenarioError, match=r"filter.estimates: is a word for other blocks"):
-        own.replace({"filter.estimates": "shared"})
-    assert own.replace({"filter.estimates": ["shared"]}).estimated == own.estimated
