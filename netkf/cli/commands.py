@@ -10,6 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
+from netkf.cli.options import MARGIN
 from netkf.core.errors import ScenarioError, quote
 from netkf.core.printable import MAX_NAME, MAX_RUNS
 from netkf.figures.names import FIGURE_NAMES, FIT_FIGURES, FORMATS
@@ -180,10 +181,6 @@ def parse_duration(text: str) -> float:
             groups = found.groups(default="0")
             return sum(unit * float(group) for unit, group in zip(units, groups, strict=True))
     raise argparse.ArgumentTypeError(f"{DURATION_RULE}; got {quote(text)}")
-
-
-MARGIN = 2
-"""Minutes of a job of an array that are left for its start, and for the end of its last block."""
 
 
 def parse_time_limit(text: str) -> float:

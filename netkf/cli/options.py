@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 FAILED = 1
 """Exit status of a command that ran without an error and whose answer is negative."""
+MARGIN = 2
+"""Minutes of a job of an array that are left for its start, and for the end of its last block."""
 
 
 class Parser(argparse.ArgumentParser):

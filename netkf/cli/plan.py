@@ -8,8 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from netkf.cli.commands import MARGIN
-from netkf.cli.options import load_scenario, print_notes
+from netkf.cli.options import MARGIN, load_scenario, print_notes
 from netkf.core.printable import count_phrase
 
 if TYPE_CHECKING:
