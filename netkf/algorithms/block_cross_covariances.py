@@ -29,6 +29,7 @@ from netkf.algorithms.kernels.block_fusion import (
     NAIVE,
     fuse,
     fusion_of,
+    multiply_in_place,
     semidefinite_root,
     solve_gain,
 )
@@ -82,21 +83,8 @@ def move_factors(record: Any, h: int, run: Any, T: FloatArray, but: int, q: int)
     """Multiply the factors of node ``h`` by ``T`` (n, n), but those of one link."""
     for w in range(run.first[h], run.first[h + 1]):
         if w != but:
-            move_factor(record.base, w, T, record.column, q)
-            move_factor(record.last, w, T, record.column, q)
-
-
-@kernel
-def move_factor(factors: FloatArray, w: int, T: FloatArray, column: FloatArray, q: int) -> None:
-    """Multiply the factor of link ``w`` by ``T`` (n, n); ``column`` is scratch."""
-    n = len(T)
-    for j in range(n):
-        for i in range(n):
-            column[i] = 0.0
-            for c in range(n):
-                column[i] += T[i, c] * factors[w, c, j, q]
-        for i in range(n):
-            factors[w, i, j, q] = column[i]
+            multiply_in_place(record.base, w, T, record.column, q)
+            multiply_in_place(record.last, w, T, record.column, q)
 
 
 @kernel
@@ -505,7 +493,7 @@ def pair_record(
         **{"other": (v,), "beside": (n + v, v), "column": (n,)},
     }
     heard = [sum(p.n for p in places) for info in infos for places in info.heard]
-    own = [sum(p.n for p in info.blocks) or n for info in infos]
+    own = [info.own_states(n) for info in infos]
     rows = max(n + v, *(info.rows for info in infos))
     return Record(
         node={"told": (n,), "told_P": square, "own": ((), ints)},

@@ -117,10 +117,13 @@ class NodeInfo(NamedTuple):
     whole: tuple[Any, ...] = ()
     heard: tuple[tuple[Any, ...], ...] = ()
 
+    def own_states(self, n: int) -> int:
+        """Return how many of its n states are of its own blocks, which come first."""
+        return sum(place.n for place in self.blocks) or n
+
     def is_own(self, H: FloatArray) -> np.ndarray:
         """Return the rows (p,) of H (p, n) that depend on blocks of the node alone."""
-        own = sum(place.n for place in self.blocks) or H.shape[1]
-        return np.asarray(~H[:, own:].any(axis=1))
+        return np.asarray(~H[:, self.own_states(H.shape[1]) :].any(axis=1))
 
 
 class Exchange(NamedTuple):

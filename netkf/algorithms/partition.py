@@ -35,6 +35,7 @@ from netkf.algorithms.kernels.block_fusion import (
     NO_GAIN,
     fuse,
     fusion_of,
+    multiply_in_place,
     semidefinite_root,
 )
 from netkf.algorithms.kernels.run import predict_estimate, shift_vector, transition
@@ -117,20 +118,6 @@ def move_vector(T: FloatArray, x: FloatArray, h: int, scratch: FloatArray) -> No
 
 
 @kernel
-def move_columns(T: FloatArray, A: FloatArray, h: int, q: int, scratch: FloatArray) -> None:
-    """Multiply the matrix ``A[h]`` by ``T`` from the left in lane ``q``."""
-    n = len(T)
-    for j in range(n):
-        for i in range(n):
-            scratch[i] = A[h, i, j, q]
-        for i in range(n):
-            total = 0.0
-            for c in range(n):
-                total += T[i, c] * scratch[c]
-            A[h, i, j, q] = total
-
-
-@kernel
 def copy_lane(A: FloatArray, h: int, q: int, end: int) -> None:
     """Copy the matrix ``A[h]`` of lane ``q`` to those up to ``end``."""
     for p in range(q + 1, end):
@@ -143,7 +130,7 @@ def copy_lane(A: FloatArray, h: int, q: int, end: int) -> None:
 def move_covariance(record: Any, P: FloatArray, h: int, q: int) -> None:
     """Replace ``P[h]`` by ``T P T' + W`` in lane ``q``."""
     T, row, n = record.T, record.row, len(record.T)
-    move_columns(T, P, h, q, row)
+    multiply_in_place(P, h, T, row, q)
     for i in range(n):
         for j in range(n):
             row[j] = P[h, i, j, q]
@@ -223,7 +210,7 @@ def predict(record: Any, h: int, run: Any) -> None:
     # Runs in which the same has happened have the same covariances, which take most of the time.
     step = L if same else 1
     for q in range(0, L, step):
-        move_columns(T, record.Phi, h, q, record.row)
+        multiply_in_place(record.Phi, h, T, record.row, q)
         move_covariance(record, record.Q, h, q)
         move_covariance(record, record.start_P, h, q)
         find_present(record, h, q, q + step)

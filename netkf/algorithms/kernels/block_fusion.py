@@ -74,6 +74,21 @@ def fusion_of(n: int, p: int) -> Fusion:
 
 
 @kernel
+def multiply_in_place(A: FloatArray, k: int, T: FloatArray, column: FloatArray, q: int) -> None:
+    """Multiply the matrix ``A[k]`` by ``T`` (n, n) from the left in lane ``q``; ``column`` (n,) is
+    scratch.
+    """
+    n = len(T)
+    for j in range(n):
+        for i in range(n):
+            column[i] = 0.0
+            for c in range(n):
+                column[i] += T[i, c] * A[k, c, j, q]
+        for i in range(n):
+            A[k, i, j, q] = column[i]
+
+
+@kernel
 def semidefinite_root(S: FloatArray, count: int) -> None:
     """Replace the lower triangle of the first ``count`` rows and columns of ``S`` by its Cholesky
     factor; columns of pivots that are rounding become 0, as S may be singular.

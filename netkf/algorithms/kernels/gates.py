@@ -85,8 +85,7 @@ def own_sizes(infos: Sequence[Any], n: int, pooled: bool) -> IntArray:
     """Return how many of its n states each node has of its own blocks: all without any, and of a
     ``pooled`` filter.
     """
-    sizes = [n if pooled else sum(place.n for place in info.blocks) or n for info in infos]
-    return np.array(sizes, dtype=np.int64)
+    return np.array([n if pooled else info.own_states(n) for info in infos], dtype=np.int64)
 
 
 @cache
