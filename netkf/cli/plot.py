@@ -23,11 +23,8 @@ def _run(options: argparse.Namespace) -> int:
     names = tuple(name for text in options.figure for name in _figure_names(text))
     has_several = len(options.directories) > 1
     if options.out is not None:
-        suffix = options.out.suffix.removeprefix(".").lower()
-        if options.format and suffix in FORMATS and suffix != options.format:
-            rule = f"is not that of {shorten(options.out)}"
-            raise ScenarioError("--format", rule, options.format, "leave one of them out")
-        _check_output(options.out, 1 if names == ("error",) else len(options.directories))
+        count = 1 if names == ("error",) else len(options.directories)
+        _check_output(options.out, count, options.format)
     results: list[Any] = []
     for directory in options.directories:
         if (directory / FIT_FILE).is_file():
@@ -36,9 +33,10 @@ def _run(options: argparse.Namespace) -> int:
             results.append(read_fit(directory))
         else:
             results.append(open_directory(directory, trust=options.trust))
+    each = list(zip(options.directories, results, strict=True))
     notes = [
         f"{directory}: {result.status}; figures show what it has kept"
-        for directory, result in zip(options.directories, results, strict=True)
+        for directory, result in each
         if getattr(result, "status", "") in ("failed", "interrupted")
     ]
     # After all that can be refused: importing matplotlib takes a second.
@@ -52,10 +50,9 @@ def _run(options: argparse.Namespace) -> int:
         target = out if is_file else out / f"errors.{file_format}"
         print(*plot_to_files(together, ("error",), target, file_format))
         names = tuple(name for name in names if name != "error")
-        if not names:
-            print_notes(notes)
-            return 0
-    for directory, result in zip(options.directories, results, strict=True):
+        # Without names all figures would be drawn.
+        each = each if names else []
+    for directory, result in each:
         if options.out is None:
             out = directory / "figures"
         else:
@@ -66,13 +63,17 @@ def _run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _check_output(out: Path, directories: int) -> None:
+def _check_output(out: Path, directories: int, file_format: str | None) -> None:
     """Raise ScenarioError or WriteError if ``out`` cannot hold the figures."""
     from netkf.runs.files import require_own
 
+    suffix = out.suffix.removeprefix(".").lower()
+    if file_format and suffix in FORMATS and suffix != file_format:
+        rule = f"is not that of {shorten(out)}"
+        raise ScenarioError("--format", rule, file_format, "leave one of them out")
     if out.is_dir():
         return
-    if out.suffix.removeprefix(".").lower() in FORMATS:
+    if suffix in FORMATS:
         if directories > 1:
             rule, remedy = "is one file for several directories", "name a directory"
             raise ScenarioError("--out", rule, str(out), remedy)
