@@ -33,7 +33,7 @@ from netkf.network.losses import (
     stated_delivery,
 )
 from netkf.network.scheduled import Hopping
-from netkf.rng.streams import Streams
+from netkf.rng.streams import Generators, Streams
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,9 +105,7 @@ class BroadcastSampler:
     there is no fate to share.
     """
 
-    def __init__(
-        self, loss: Loss, link: Link, several: bool, generator: Callable[[str], np.random.Generator]
-    ) -> None:
+    def __init__(self, loss: Loss, link: Link, several: bool, generator: Generators) -> None:
         self._loss, self._link = loss, link
         self._bad: bool | None = None
         self._random = generator("broadcast") if several and loss.fate_share > 0.0 else None
@@ -195,9 +193,7 @@ class Broadcasts:
         return self._last[sender].over(draw)
 
 
-def _of_sender(
-    generator: Callable[[str, int], np.random.Generator], sender: int
-) -> Callable[[str], np.random.Generator]:
+def _of_sender(generator: Callable[[str, int], np.random.Generator], sender: int) -> Generators:
     return lambda purpose: generator(purpose, sender)
 
 
@@ -221,9 +217,7 @@ class ChannelSampler:
     called only for the streams that the channel draws from.
     """
 
-    def __init__(
-        self, channel: Channel, link: Link, generator: Callable[[str], np.random.Generator]
-    ) -> None:
+    def __init__(self, channel: Channel, link: Link, generator: Generators) -> None:
         """Make a stream of ``generator(purpose)`` for each purpose, so that losses, states and
         delays do not depend on each other's number of draws.
         """

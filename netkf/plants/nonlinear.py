@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -44,6 +44,7 @@ from netkf.plants.readings import (
 )
 from netkf.plants.sampling import DrawnSamples, Samples, sampling
 from netkf.plants.sensors import Sensor, sampling_ticks
+from netkf.rng.streams import Generators
 
 GRAPH = "graph"
 
@@ -207,9 +208,7 @@ class NonlinearSensor(Sensor):
         """Return zeros (p, n): H is unknown before there is an estimate."""
         return np.zeros((len(self.R), n))
 
-    def slot_path(
-        self, node: int, period: float, generator: Callable[[str], np.random.Generator]
-    ) -> Any:
+    def slot_path(self, node: int, period: float, generator: Generators) -> Any:
         """Return the readings of the sensor on ``node`` (id) in one run, see Sensor."""
         if self.record is None:
             return NonlinearReadings(self, node, generator("noise"))
@@ -225,11 +224,7 @@ class NonlinearSensor(Sensor):
         )
 
     def sample_times(
-        self,
-        node: int,
-        ordinal: int,
-        generator: Callable[[str], np.random.Generator],
-        horizon: float,
+        self, node: int, ordinal: int, generator: Generators, horizon: float
     ) -> FloatArray:
         """Return the times (K,) of its table, or of the ticks of ``sampling``, see Sensor."""
         if self.record is not None:
@@ -238,9 +233,7 @@ class NonlinearSensor(Sensor):
         assert self.sampling is not None
         return sampling_ticks(self.sampling, (node, ordinal), generator, horizon)
 
-    def samples(
-        self, node: int, generator: Callable[[str], np.random.Generator], horizon: float
-    ) -> Samples:
+    def samples(self, node: int, generator: Generators, horizon: float) -> Samples:
         """Return the samples of the sensor on ``node`` (id) in one run, see Sensor."""
         if self.record is not None:
             return RecordedSamples(self.record.rows(node), self._row_functions(node))

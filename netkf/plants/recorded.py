@@ -7,7 +7,7 @@ has no row for a slot has no reading in that slot.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
@@ -38,6 +38,7 @@ from netkf.plants.readings import (
 )
 from netkf.plants.sensors import Sensor
 from netkf.plants.states import RecordedStates, state_file
+from netkf.rng.streams import Generators
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,24 +162,16 @@ class RecordedSensor(Sensor):
         return lambda k, present: self.H[present] if phi is None else phi[k : k + 1]
 
     def sample_times(
-        self,
-        node: int,
-        ordinal: int,
-        generator: Callable[[str], np.random.Generator],
-        horizon: float,
+        self, node: int, ordinal: int, generator: Generators, horizon: float
     ) -> FloatArray:
         """Return the times (K,) in seconds, below the ``horizon``, of the rows of ``node`` (id)."""
         return self.record.times(node, horizon)
 
-    def samples(
-        self, node: int, generator: Callable[[str], np.random.Generator], horizon: float
-    ) -> RecordedSamples:
+    def samples(self, node: int, generator: Generators, horizon: float) -> RecordedSamples:
         """Return the samples of the table's rows of ``node`` (id); nothing is drawn."""
         return RecordedSamples(self.record.rows(node), self._matrix_function(node))
 
-    def slot_path(
-        self, node: int, period: float, generator: Callable[[str], np.random.Generator]
-    ) -> RecordedReadings:
+    def slot_path(self, node: int, period: float, generator: Generators) -> RecordedReadings:
         """Return the readings of the table's rows of ``node`` (id) in slots; nothing is drawn."""
         record = self.record
         rows, slots, n = record.rows(node), record.slots(node, period), self.H.shape[1]

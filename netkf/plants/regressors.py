@@ -6,7 +6,7 @@ on the network. Filters are given it with the reading.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,6 +17,7 @@ from netkf.linalg.arrays import FloatArray, readonly_array
 from netkf.linalg.portable import apply, noise_root, product
 from netkf.plants.linear import LinearPath, SlotReadings
 from netkf.plants.sensors import Sensor
+from netkf.rng.streams import Generators
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +51,7 @@ class RegressorSensor(Sensor):
         """The matrix B S (m, q) that maps standard normals to ``B xi_k``, with xi_cov = S S'."""
         return product(self.B, noise_root(self.xi_cov))
 
-    def slot_path(
-        self, node: int, period: float, generator: Callable[[str], np.random.Generator]
-    ) -> RegressorReadings:
+    def slot_path(self, node: int, period: float, generator: Generators) -> RegressorReadings:
         """Return the readings of the sensor on ``node`` (id) in one run, see Sensor."""
         return RegressorReadings(self, generator("noise"), generator("regressor"))
 

@@ -8,7 +8,7 @@ stacked state, one for each pair, or one for each node where readings are record
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
@@ -45,6 +45,7 @@ from netkf.plants.readings import ReadingTable, take_from_record
 from netkf.plants.recorded import RecordedSensor
 from netkf.plants.sampling import sampling
 from netkf.plants.sensors import LinearSensor, Sensor
+from netkf.rng.streams import Generators
 
 NEIGHBOURS = "neighbours"
 Pairs = tuple[tuple[int, int], ...]
@@ -98,9 +99,7 @@ class RelativeSensor(Sensor):
         """Return H (p, n) of a block of n components."""
         return np.eye(n) if self.H is None else self.H
 
-    def slot_path(
-        self, node: int, period: float, generator: Callable[[str], np.random.Generator]
-    ) -> Any:
+    def slot_path(self, node: int, period: float, generator: Generators) -> Any:
         """Raise TypeError: scenarios replace the sensor before a run."""
         raise TypeError("a relative sensor reads blocks of [[plants]]")
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
@@ -43,6 +42,7 @@ from netkf.plants.linear import Blocks, Readings, SlotReadings
 from netkf.plants.paths import DiffusionPath
 from netkf.plants.readings import ReadingTable
 from netkf.plants.sampling import DrawnSamples, Samples, sampling
+from netkf.rng.streams import Generators
 
 ROOT_3 = math.sqrt(3.0)
 
@@ -86,9 +86,7 @@ class Sensor(Component):
         return H
 
     @abstractmethod
-    def slot_path(
-        self, node: int, period: float, generator: Callable[[str], np.random.Generator]
-    ) -> Readings:
+    def slot_path(self, node: int, period: float, generator: Generators) -> Readings:
         """Return the readings of the sensor on ``node`` (id) in one run, in slots of ``period``
         seconds. The engine calls this once for each sensor and run, over a plant in slots.
 
@@ -96,11 +94,7 @@ class Sensor(Component):
         """
 
     def sample_times(
-        self,
-        node: int,
-        ordinal: int,
-        generator: Callable[[str], np.random.Generator],
-        horizon: float,
+        self, node: int, ordinal: int, generator: Generators, horizon: float
     ) -> FloatArray:
         """Return the times (K,) in seconds, below the ``horizon``, at which the sensor on ``node``
         samples; ``ordinal`` is its number among the sensors of that node and ``generator`` returns
@@ -110,9 +104,7 @@ class Sensor(Component):
         """
         return np.empty(0)
 
-    def samples(
-        self, node: int, generator: Callable[[str], np.random.Generator], horizon: float
-    ) -> Samples:
+    def samples(self, node: int, generator: Generators, horizon: float) -> Samples:
         """Return the samples of the sensor on ``node`` (id) at its ``sample_times`` below the
         ``horizon`` (seconds) in one run; ``generator`` returns the random stream of that sensor for
         a purpose. To be defined by sensors that have sample times.
@@ -121,10 +113,7 @@ class Sensor(Component):
 
 
 def sampling_ticks(
-    clock: Clock,
-    entity: tuple[int, int],
-    generator: Callable[[str], np.random.Generator],
-    horizon: float,
+    clock: Clock, entity: tuple[int, int], generator: Generators, horizon: float
 ) -> FloatArray:
     """Return the times (K,) in seconds, below the ``horizon``, at which the ``clock`` of a sensor,
     ``entity`` = (node, ordinal), ticks. ``generator`` returns its streams for the purposes
@@ -150,20 +139,14 @@ class LinearSensor(Sensor):
     of: str | None = field(text, default=None)
 
     def sample_times(
-        self,
-        node: int,
-        ordinal: int,
-        generator: Callable[[str], np.random.Generator],
-        horizon: float,
+        self, node: int, ordinal: int, generator: Generators, horizon: float
     ) -> FloatArray:
         """Return the times (K,) of the ticks of ``sampling``, see Sensor."""
         # Only sensors with a clock are asked.
         assert self.sampling is not None
         return sampling_ticks(self.sampling, (node, ordinal), generator, horizon)
 
-    def samples(
-        self, node: int, generator: Callable[[str], np.random.Generator], horizon: float
-    ) -> DrawnSamples:
+    def samples(self, node: int, generator: Generators, horizon: float) -> DrawnSamples:
         """Return the samples of the sensor on ``node`` (id) in one run, see Sensor."""
         return DrawnSamples(self.H, self.R, generator("noise"))
 
@@ -173,9 +156,7 @@ class LinearSensor(Sensor):
         """
         return SensorPath(self.H, self.R, random, cutting)
 
-    def slot_path(
-        self, node: int, period: float, generator: Callable[[str], np.random.Generator]
-    ) -> SlotReadings:
+    def slot_path(self, node: int, period: float, generator: Generators) -> SlotReadings:
         """Return the readings of the sensor on ``node`` (id) in slots, see Sensor."""
         return SlotReadings(self.H, self.R, generator("noise"))
 

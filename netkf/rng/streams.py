@@ -13,7 +13,7 @@ hold only its counters (``rng.draws``).
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import Any, cast
@@ -28,6 +28,8 @@ of the present block, how many of these are used, and half of a word that is lef
 """
 WIDTH, BLOCK_WORDS = 12, 4
 WORD, LONG = 1 << 32, 1 << 64
+Generators = Callable[[str], np.random.Generator]
+"""Function from a purpose, a short text, to the random stream of one entity for it."""
 
 
 @dataclass(frozen=True)

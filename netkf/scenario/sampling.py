@@ -7,7 +7,7 @@ or at the times of its table (``recorded``).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ from netkf.network.node_clocks import node_time
 from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.sampling import RecordedSampling, Samples
 from netkf.plants.sensors import LinearSensor, Sensor
-from netkf.rng.streams import Streams
+from netkf.rng.streams import Generators, Streams
 from netkf.scenario.block_sensors import support_of
 from netkf.scenario.model import PlacedSensor, ScenarioModel, takes_samples
 from netkf.scenario.positions import tick_times
@@ -82,9 +82,7 @@ def _iterate_sampled_sensors(scenario: ScenarioModel) -> Iterator[tuple[int, Pla
             yield node, placed_sensor
 
 
-def _make_generator(
-    streams: Streams, node: int, placed_sensor: PlacedSensor
-) -> Callable[[str], np.random.Generator]:
+def _make_generator(streams: Streams, node: int, placed_sensor: PlacedSensor) -> Generators:
     return lambda purpose: streams.generator(purpose, node, placed_sensor.ordinal)
 
 

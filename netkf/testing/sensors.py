@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sensors import LinearSensor, Sensor
-from netkf.rng.streams import Streams
+from netkf.rng.streams import Generators, Streams
 from netkf.scenario.plugins import describe_failure
 from netkf.testing.dynamics import check_derivatives
 from netkf.testing.noise import (
@@ -134,7 +134,7 @@ class SensorReader:
         return ReadingSeries(y[None], demand_array(self.where, "H", H, (self.p, self.n))[None])
 
 
-def generators(streams: Streams, node: int) -> Callable[[str], np.random.Generator]:
+def generators(streams: Streams, node: int) -> Generators:
     """Return the function from purposes to random generators of the first sensor of a node."""
     return lambda purpose: streams.generator(purpose, node, 0)
 
