@@ -10,6 +10,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.random import Generator
 
 from netkf.core.errors import ScenarioError, quote
 from netkf.core.fields import Component, boolean, number, stated
@@ -41,13 +42,7 @@ class Clock(Component):
 
     @abstractmethod
     def ticks(
-        self,
-        entity: Entity,
-        origin: float,
-        index: int,
-        now: float,
-        random: np.random.Generator,
-        count: int,
+        self, entity: Entity, origin: float, index: int, now: float, random: Generator, count: int
     ) -> FloatArray:
         """Return the times (<= count,) in seconds of the next ticks of ``entity``, at most
         ``count``, from number ``index`` on, drawn from ``random``.
@@ -57,7 +52,7 @@ class Clock(Component):
         depend on ``count``: two short blocks are the same ticks as a long one.
         """
 
-    def origin(self, entity: Entity, random: Callable[[], np.random.Generator]) -> float:
+    def origin(self, entity: Entity, random: Callable[[], Generator]) -> float:
         """Return a number that is drawn once per entity from ``random()``, such as a phase.
 
         It is passed to every call of :meth:`ticks`; 0 if the clock needs none.
@@ -106,7 +101,7 @@ def next_ticks(
     clock: Clock,
     entity: Entity,
     position: ClockPosition,
-    random: np.random.Generator,
+    random: Generator,
     count: int,
     key: str = "network.activation",
 ) -> FloatArray:
@@ -134,8 +129,8 @@ def next_ticks(
 def generate_ticks(
     clock: Clock,
     entity: Entity,
-    make_origin_random: Callable[[], np.random.Generator],
-    random: np.random.Generator,
+    make_origin_random: Callable[[], Generator],
+    random: Generator,
     horizon: float,
     key: str = "network.activation",
 ) -> FloatArray:

@@ -104,6 +104,8 @@ class Component:
     """Methods of a contract that are called only where another member is True."""
     _values: ClassVar[Mapping[str, Rule]] = {}
     """The rules of members of a contract that are values, which users' classes may override."""
+    _reads: ClassVar[str] = ""
+    """A property that reads a table: on construction, so that mistakes in the file are found."""
 
     def __new__(cls, *values: Any, **named: Any) -> Self:
         """Return a new object; raises ScenarioError for settings without a name that must have one,
@@ -134,6 +136,8 @@ class Component:
                 object.__setattr__(self, field.name, rule(field.name, value))
         if self._called_if and not is_netkf_class(type(self)):
             hold_to_flags(self, self._called_if)
+        if self._reads:
+            getattr(self, self._reads)
 
     def __eq__(self, other: object) -> bool:
         """Return True if both components have the same class and equal fields."""

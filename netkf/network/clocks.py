@@ -355,10 +355,7 @@ class RecordedClock(LinkClock):
 
     grid_values: ClassVar[tuple[str, ...]] = ("_instants",)
 
-    def __post_init__(self) -> None:
-        """Check the fields and read the table; raises ScenarioError for a mistake in either."""
-        super().__post_init__()
-        _ = self._instants  # a mistake in the file is found on construction
+    _reads = "_instants"
 
     @cached_property
     def _rows(self) -> tuple[list[tuple[Entity, float]], dict[Entity, int]]:

@@ -129,10 +129,7 @@ class RecordedLife(Life):
 
     path: SourceFile = field(source_file)
 
-    def __post_init__(self) -> None:
-        """Check the fields and read the table; raises ScenarioError for a mistake in either."""
-        super().__post_init__()
-        _ = self._table  # a mistake in the file is found on construction
+    _reads = "_table"
 
     @cached_property
     def _table(self) -> tuple[dict[int, list[Change]], list[tuple[int, float]]]:

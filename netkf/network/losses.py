@@ -333,6 +333,7 @@ class GilbertElliott(Loss):
 
     stateful = True
     vectorised = True
+    _reads = "_table"
 
     to_bad: float | None = field(probability, default=None)
     to_good: float | None = field(number(above=0.0, high=1.0), default=None)
@@ -348,10 +349,8 @@ class GilbertElliott(Loss):
         possible.
         """
         super().__post_init__()
-        if self.path is not None:
-            _ = self._table  # a mistake in the file is found on construction
-            if all(getattr(self, name) is None for name in _CHAIN):
-                return
+        if self.path is not None and all(getattr(self, name) is None for name in _CHAIN):
+            return
         # One of two forms, each with two required fields: transition probabilities, or means.
         chain = {name: getattr(self, name) for name in ("to_bad", "to_good")}
         means = {name: getattr(self, name) for name in ("mean_loss", "mean_burst")}

@@ -258,10 +258,7 @@ class RecordedSlots(SlotActivation):
 
     path: SourceFile = field(source_file)
 
-    def __post_init__(self) -> None:
-        """Check the fields and read the table; raises ScenarioError for a mistake in either."""
-        super().__post_init__()
-        _ = self._pairs  # a mistake in the file is found on construction
+    _reads = "_pairs"
 
     @property
     def matching(self) -> bool:

@@ -104,10 +104,7 @@ class _Recorded(Component):
 
     table: ClassVar[Any]
 
-    def __post_init__(self) -> None:
-        """Check the fields and read the table; raises ScenarioError for a mistake in either."""
-        super().__post_init__()
-        _ = self.table  # a mistake in the file is found on construction
+    _reads = "table"
 
     def check(self, topology: Topology) -> None:
         """Raise ScenarioError unless every recorded pair is a link."""

@@ -56,10 +56,7 @@ class ScheduledLoss(Loss, OnGrid):
     path: SourceFile = field(source_file)
     otherwise: float = field(probability, default=1.0)
 
-    def __post_init__(self) -> None:
-        """Check the fields and read the table; raises ScenarioError for a mistake in either."""
-        super().__post_init__()
-        _ = self._steps  # a mistake in the file is found on construction
+    _reads = "_steps"
 
     @cached_property
     def _steps(

@@ -43,7 +43,7 @@ from netkf.plants.readings import (
     take_from_record,
 )
 from netkf.plants.sampling import DrawnSamples, Samples, sampling
-from netkf.plants.sensors import Sensor, sampling_ticks
+from netkf.plants.sensors import Sensor
 from netkf.rng.streams import Generators
 
 GRAPH = "graph"
@@ -229,9 +229,7 @@ class NonlinearSensor(Sensor):
         """Return the times (K,) of its table, or of the ticks of ``sampling``, see Sensor."""
         if self.record is not None:
             return self.record.times(node, horizon)
-        # Only sensors with a clock are asked.
-        assert self.sampling is not None
-        return sampling_ticks(self.sampling, (node, ordinal), generator, horizon)
+        return super().sample_times(node, ordinal, generator, horizon)
 
     def samples(self, node: int, generator: Generators, horizon: float) -> Samples:
         """Return the samples of the sensor on ``node`` (id) in one run, see Sensor."""

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
+from numpy.random import Generator
 
 from netkf.core.clock import Clock, Entity
 from netkf.core.csv_files import read_columns
@@ -38,7 +39,7 @@ class DrawnSamples:
     Cholesky factor of R times the next p standard normals of ``random``.
     """
 
-    def __init__(self, H: FloatArray, R: FloatArray, random: np.random.Generator) -> None:
+    def __init__(self, H: FloatArray, R: FloatArray, random: Generator) -> None:
         self._readings = SlotReadings(H, R, random)
 
     def reading(self, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -58,9 +59,7 @@ class RecordedSampling(Clock):
 
     path: SourceFile = field(source_file)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _ = self._times  # a mistake in the file is found on construction
+    _reads = "_times"
 
     @cached_property
     def row_times(self) -> list[tuple[int, float]]:
@@ -90,13 +89,7 @@ class RecordedSampling(Clock):
         return self._times.get(node, np.empty(0))
 
     def ticks(
-        self,
-        entity: Entity,
-        origin: float,
-        index: int,
-        now: float,
-        random: np.random.Generator,
-        count: int,
+        self, entity: Entity, origin: float, index: int, now: float, random: Generator, count: int
     ) -> FloatArray:
         """Return up to ``count`` recorded times of the node ``entity[0]``, from number ``index``
         on.

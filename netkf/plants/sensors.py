@@ -100,9 +100,13 @@ class Sensor(Component):
         samples; ``ordinal`` is its number among the sensors of that node and ``generator`` returns
         its random stream for a purpose. Called once for each sampling sensor and run.
 
-        There are none by default: only sensors in continuous time with a clock sample.
+        By default they are the ticks of a clock ``sampling``, and there are none without one.
         """
-        return np.empty(0)
+        clock = getattr(self, "sampling", None)
+        if not isinstance(clock, Clock):
+            return np.empty(0)
+        phase, random = partial(generator, "sampling phase"), generator("sampling")
+        return generate_ticks(clock, (node, ordinal), phase, random, horizon, "sampling")
 
     def samples(self, node: int, generator: Generators, horizon: float) -> Samples:
         """Return the samples of the sensor on ``node`` (id) at its ``sample_times`` below the
@@ -110,17 +114,6 @@ class Sensor(Component):
         a purpose. To be defined by sensors that have sample times.
         """
         raise NotImplementedError
-
-
-def sampling_ticks(
-    clock: Clock, entity: tuple[int, int], generator: Generators, horizon: float
-) -> FloatArray:
-    """Return the times (K,) in seconds, below the ``horizon``, at which the ``clock`` of a sensor,
-    ``entity`` = (node, ordinal), ticks. ``generator`` returns its streams for the purposes
-    "sampling" and "sampling phase".
-    """
-    phase = partial(generator, "sampling phase")
-    return generate_ticks(clock, entity, phase, generator("sampling"), horizon, "sampling")
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,14 +130,6 @@ class LinearSensor(Sensor):
     R: FloatArray = field(definite_covariance)
     sampling: Clock | None = field(sampling, default=None)
     of: str | None = field(text, default=None)
-
-    def sample_times(
-        self, node: int, ordinal: int, generator: Generators, horizon: float
-    ) -> FloatArray:
-        """Return the times (K,) of the ticks of ``sampling``, see Sensor."""
-        # Only sensors with a clock are asked.
-        assert self.sampling is not None
-        return sampling_ticks(self.sampling, (node, ordinal), generator, horizon)
 
     def samples(self, node: int, generator: Generators, horizon: float) -> DrawnSamples:
         """Return the samples of the sensor on ``node`` (id) in one run, see Sensor."""
