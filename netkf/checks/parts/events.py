@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from netkf.network.matchings import Matching
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.random_links import has_constant_losses
+from netkf.trace.messages import LOST
 from netkf.trace.run import Run
 from netkf.trace.schema import rows_of
 
@@ -185,67 +186,41 @@ def _redraws_links(scenario: Scenario) -> bool:
     return all(filter_.timing.redraws(*step) for step in steps)
 
 
-class Messages(NamedTuple):
-    """The K messages of a run, in order of direction and number: the rows in which they were
-    ``sent``, the ``direction`` (K,) of each, whether it is ``lost`` (K,), and its ``age`` (K,) at
-    arrival, inf without one.
+def losses_of(scenario: Scenario, messages: np.ndarray) -> LossCounts | None:
+    """Return counts of sent and lost messages by window and direction, from MESSAGE rows (M,); None
+    without links.
     """
-
-    sent: np.ndarray
-    direction: IntArray
-    lost: np.ndarray
-    age: FloatArray
-
-
-def messages_of(scenario: Scenario, run: Run) -> Messages:
-    """Return the messages of a run, each with what became of it."""
-    kinds = ("send",), ("lost",), ("deliver", "late")
-    sends, losses, arrivals = (rows_of(run.log, *names) for names in kinds)
-    width = int(sends["message"].max(initial=0)) + 1
-
-    def keys(rows: np.ndarray, sender: str, receiver: str) -> IntArray:
-        """Return one integer for each message: its direction, and its number in that."""
-        places = _places(scenario.topology.directions, [rows[sender], rows[receiver]])
-        return np.asarray(places * width + rows["message"], dtype=np.int64)
-
-    sent = keys(sends, "node", "peer")
-    order = np.argsort(sent, kind="stable")
-    sends, sent = sends[order], sent[order]
-    # The receiver of a message comes first in the row of its arrival.
-    arrived, age = keys(arrivals, "peer", "node"), np.full(len(sent), np.inf)
-    known = np.isin(arrived, sent)
-    age[np.searchsorted(sent, arrived[known])] = arrivals["age"][known]
-    return Messages(sends, sent // width, np.isin(sent, keys(losses, "node", "peer")), age)
-
-
-def losses_of(scenario: Scenario, messages: Messages) -> LossCounts | None:
-    """Return counts of sent and lost messages by window and direction; None without links."""
     size, horizon = len(scenario.topology.directions), scenario.horizon
     if not size:
         return None
-    sends, direction, is_lost, _ = messages
-    sent = count_by_window(sends["t"], direction, size, horizon)
-    lost = count_by_window(sends["t"][is_lost], direction[is_lost], size, horizon)
+    direction, times = _directions(scenario, messages), messages["sent"]
+    is_lost = messages["outcome"] == LOST
+    sent = count_by_window(times, direction, size, horizon)
+    lost = count_by_window(times[is_lost], direction[is_lost], size, horizon)
     # Of a message and the next one of its direction.
     first = direction[:-1][is_lost[:-1] & (direction[1:] == direction[:-1])]
     twice = direction[:-1][is_lost[:-1] & is_lost[1:] & (direction[1:] == direction[:-1])]
     # Of a message and that of the same number in the opposite direction.
     back, begins = loss_law(scenario).opposite[direction], np.searchsorted(direction, range(size))
-    has_other = (back >= 0) & (sends["message"] < sent.sum(axis=0)[back])
-    other = np.where(has_other, begins[back] + sends["message"], 0)
+    has_other = (back >= 0) & (messages["number"] < sent.sum(axis=0)[back])
+    other = np.where(has_other, begins[back] + messages["number"], 0)
     both = direction[is_lost & has_other & is_lost[other]]
     counts = [np.bincount(column, minlength=size) for column in (first, twice, both)]
     of_broadcasts = slice(None) if scenario.has_broadcasts else slice(0)
-    hearers = _pairs_of_hearers(sends[of_broadcasts], is_lost[of_broadcasts])
+    hearers = _pairs_of_hearers(messages[of_broadcasts], is_lost[of_broadcasts])
     # Those of hundreds of runs are in memory at once.
     short = np.int16 if sent.max() < 1 << 15 else np.int32
     return LossCounts(*(column.astype(short) for column in (sent, lost, *counts)), *hearers)
 
 
-def _pairs_of_hearers(sends: np.ndarray, is_lost: np.ndarray) -> list[np.ndarray]:
+def _directions(scenario: Scenario, messages: np.ndarray) -> IntArray:
+    return _places(scenario.topology.directions, [messages["sender"], messages["receiver"]])
+
+
+def _pairs_of_hearers(messages: np.ndarray, is_lost: np.ndarray) -> list[np.ndarray]:
     """Return the number of pairs of messages (K,) of one broadcast, and of those both lost."""
-    order = np.lexsort((sends["node"], sends["phase"], sends["t"]))
-    changes = [np.diff(sends[name][order]) != 0 for name in ("t", "phase", "node")]
+    order = np.lexsort([messages[name] for name in ("sender", "phase", "sent")])
+    changes = [np.diff(messages[name][order]) != 0 for name in ("sent", "phase", "sender")]
     begins = np.flatnonzero(np.append(True, np.any(changes, axis=0)) if len(order) else [])
     sizes = np.diff(np.append(begins, len(order)))
     gone = np.add.reduceat(is_lost[order].astype(np.int64), begins) if len(begins) else sizes
@@ -303,17 +278,18 @@ def stated_delay(scenario: Scenario) -> tuple[float | None, Any]:
     return stated_part(delay, "delay").fixed, stated_law(delay, "delay")
 
 
-def delays_of(scenario: Scenario, messages: Messages) -> DelayCounts | None:
-    """Return counts of delays by direction, None without links or a stated law. Messages that have
-    not arrived when the run ends take longer than that.
+def delays_of(scenario: Scenario, messages: np.ndarray) -> DelayCounts | None:
+    """Return counts of delays by direction, from MESSAGE rows (M,); None without links or a stated
+    law. Messages that have not arrived when the run ends take longer than that.
     """
     (fixed, law), losses = stated_delay(scenario), loss_law(scenario)
     if not losses.links or (fixed is None and law is None):
         return None
     if fixed is not None:
-        return count_fixed(messages.age[np.isfinite(messages.age)], fixed)
+        return count_fixed(messages["age"][np.isfinite(messages["age"])], fixed)
     second = np.array([i > j for i, j in losses.links]) & (losses.opposite >= 0) & losses.shared
-    followed = ~messages.lost & ~second[messages.direction]
-    sent, direction = messages.sent["t"][followed], messages.direction[followed]
-    ages, size = messages.age[followed], len(losses.links)
+    direction = _directions(scenario, messages)
+    followed = (messages["outcome"] != LOST) & ~second[direction]
+    ages = np.nan_to_num(messages["age"][followed], nan=np.inf)
+    sent, direction, size = messages["sent"][followed], direction[followed], len(losses.links)
     return count_delays(law, sent, ages, direction, size, scenario.horizon)

@@ -9,7 +9,6 @@ from typing import Any
 from netkf.checks.parts.events import (
     delays_of,
     losses_of,
-    messages_of,
     pairs_of,
     samples_of,
     ticks_of,
@@ -22,6 +21,7 @@ from netkf.laws.noise import NoiseDraws
 from netkf.laws.ticks import TickCounts
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
+from netkf.trace.messages import join_messages
 from netkf.trace.run import Run
 
 PART_TYPES: dict[str, type[Any]] = {
@@ -42,7 +42,7 @@ def summarise_parts(scenario: Scenario, run: Run) -> dict[str, Any]:
     """Return counts and draws of a run by the names of PART_TYPES, to compare parts with their
     laws; without those of parts that the scenario has not. Noises are drawn again.
     """
-    streams, messages = Streams(run.seed, run.replica), messages_of(scenario, run)
+    streams, messages = Streams(run.seed, run.replica), join_messages(run.log)
     found = {
         "ticks": ticks_of(scenario, run),
         "fates": losses_of(scenario, messages),
