@@ -13,18 +13,19 @@ states all information of the sender, which replaces that of the receiver.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from netkf.linalg.arrays import FloatArray
 from netkf.network.deliveries import MessageKey
 from netkf.scenario.derived import DerivedScenario
-from netkf.trace.messages import DELIVERED, join_messages
+from netkf.trace.messages import DELIVERED, MESSAGE, join_messages
 from netkf.trace.schema import CODES
 
 IntArray = np.ndarray
+Messages = np.recarray
+"""The M messages of a log, FOLLOWED rows (M,) ordered by directed link and number."""
 NEVER = -1
 OUTCOMES = ("used", "lost", "late", "refused", "under way", "unused")
 """Outcome of a message at the end of a log. Late messages arrived after the exchange of their slot,
@@ -36,41 +37,16 @@ ENDS = ("absorb", "swap", "crash", "leave")
 """Kinds of events after which nothing that arrived before waits at a node."""
 
 
-@dataclass(frozen=True, eq=False)
-class Messages:
-    """The M messages of a log, ordered by directed link and number.
+FOLLOWED = np.dtype([*MESSAGE.descr, ("used_row", "i8")])
+"""A MESSAGE whose ``outcome`` is an index of OUTCOMES, and which has ``ended`` if it arrived;
+used_row: row of the log at which its receiver used what had arrived, NEVER if it did not in time.
+"""
 
-    ``sender``, ``receiver`` and ``number`` (M,) name them; ``sent`` and ``arrived`` (M,) are times
-    in seconds (nan: not arrived), ``phase`` (M,) the exchange of the slot (-1 under clocks),
-    ``outcome`` (M,) is an index of OUTCOMES. ``sent_row`` and ``used_row`` (M,) are the rows of the
-    log at which the message was sent and at which its receiver used what had arrived (NEVER if it
-    did not arrive in time).
-    """
 
-    sender: IntArray
-    receiver: IntArray
-    number: IntArray
-    sent: FloatArray
-    arrived: FloatArray
-    phase: IntArray
-    outcome: IntArray
-    sent_row: IntArray
-    used_row: IntArray
-
-    def __len__(self) -> int:
-        """Number of messages."""
-        return len(self.sender)
-
-    def key(self, m: int) -> MessageKey:
-        """Return the identity of message ``m``."""
-        return MessageKey(int(self.sender[m]), int(self.receiver[m]), int(self.number[m]))
-
-    def keys(self, messages: IntArray) -> list[MessageKey]:
-        """Return the identities of the K ``messages`` (K,)."""
-        columns = (
-            column[messages].tolist() for column in (self.sender, self.receiver, self.number)
-        )
-        return list(map(MessageKey, *columns))
+def message_keys(messages: np.ndarray) -> list[MessageKey]:
+    """Return the identities of messages."""
+    columns = (messages[name].tolist() for name in ("sender", "receiver", "number"))
+    return list(map(MessageKey, *columns))
 
 
 def match_messages(log: IntArray, swaps: bool, slotted: bool) -> Messages:
@@ -95,17 +71,12 @@ def match_messages(log: IntArray, swaps: bool, slotted: bool) -> Messages:
         order = used[np.lexsort((joined["sent_row"][used], joined["sender"][used], used_row[used]))]
         is_last = np.append(np.diff(used_row[order]) != 0, True)[: len(order)]
         outcome[order[~is_last]] = UNUSED
-    return Messages(
-        sender=joined["sender"],
-        receiver=joined["receiver"],
-        number=joined["number"],
-        sent=joined["sent"],
-        arrived=np.where(outcome == LOST, np.nan, joined["ended"]),
-        phase=joined["phase"],
-        outcome=outcome,
-        sent_row=joined["sent_row"],
-        used_row=used_row,
-    )
+    messages = np.recarray(len(joined), dtype=FOLLOWED)
+    for name in MESSAGE.names or ():
+        messages[name] = joined[name]
+    messages.outcome, messages.used_row = outcome, used_row
+    messages.ended[outcome == LOST] = np.nan
+    return messages
 
 
 def _next_use(log: IntArray, rows: IntArray) -> IntArray:
@@ -129,8 +100,9 @@ def at_once(messages: Messages, log: IntArray) -> Messages:
     """
     # The last row of the instant of sending.
     last = np.searchsorted(log["t"], messages.sent, side="right") - 1
-    used = np.where(messages.outcome == USED, messages.used_row, last)
-    return replace(messages, used_row=used)
+    changed = messages.copy()
+    changed.used_row = np.where(messages.outcome == USED, messages.used_row, last)
+    return changed
 
 
 def rows_until(scenario: DerivedScenario, log: IntArray, at: float) -> IntArray:

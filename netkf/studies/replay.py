@@ -29,7 +29,15 @@ from netkf.network.deliveries import (
 )
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
-from netkf.studies.information import LATE, REFUSED, UNDER_WAY, IntArray, match_messages, rows_until
+from netkf.studies.information import (
+    LATE,
+    REFUSED,
+    UNDER_WAY,
+    IntArray,
+    match_messages,
+    message_keys,
+    rows_until,
+)
 
 
 class Outcome(NamedTuple):
@@ -80,8 +88,8 @@ class Replayer:
         """Messages not lost but unused because of their delay; replays deliver them at once."""
         scenario = self.scenario
         messages = match_messages(self.log, scenario.node_filter.analysis.swaps, scenario.slotted)
-        unused = np.flatnonzero(np.isin(messages.outcome, (LATE, REFUSED, UNDER_WAY)))
-        return frozenset(messages.keys(unused))
+        unused = np.isin(messages.outcome, (LATE, REFUSED, UNDER_WAY))
+        return frozenset(message_keys(messages[unused]))
 
     @cached_property
     def full_log(self) -> IntArray:

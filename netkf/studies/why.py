@@ -26,6 +26,7 @@ from netkf.studies.information import (
     at_once,
     find_flow,
     match_messages,
+    message_keys,
     newest_information,
     route,
     rows_until,
@@ -203,21 +204,19 @@ class _Evidence:
         # best.
         full_flow = find_flow(self.scenario, replayer.full_log, full)
         self._full_search = replayer.full_log, search_back(full_flow, node)
-        unused = np.flatnonzero(~was_used)
+        unused = self.messages[~was_used]
         named = {n: self.scenario.topology.named(n) for n in self.scenario.nodes}
-        times = self.messages.sent[unused].tolist(), self.messages.arrived[unused].tolist()
-        outcomes = map(OUTCOMES.__getitem__, self.messages.outcome[unused].tolist())
-        keys = self.messages.keys(unused)
+        columns = unused.outcome.tolist(), unused.sent.tolist(), unused.ended.tolist()
         self.missing: dict[MessageKey, Missing] = {
-            key: Missing(named[key[0]], named[key[1]], key[2], *rest)
-            for key, *rest in zip(keys, outcomes, *times, strict=True)
+            key: Missing(named[key[0]], named[key[1]], key[2], OUTCOMES[outcome], *times)
+            for key, outcome, *times in zip(message_keys(unused), *columns, strict=True)
         }
 
     def candidates(self) -> list[Candidate]:
         """Return the unused messages whose information could have reached the node."""
         # The cost of a message is 1 if it was not used in the run, else 0.
         unused = np.flatnonzero(self._flow.cost)
-        times, keys = self.messages.sent[unused].tolist(), self.messages.keys(unused)
+        times, keys = self.messages.sent[unused].tolist(), message_keys(self.messages[unused])
         rows = zip(keys, times, map(self._reach.needed, unused.tolist()), strict=True)
         return [Candidate(key, sent, needed) for key, sent, needed in rows if needed is not None]
 
@@ -257,16 +256,15 @@ class _Evidence:
         if budget is not None:
             newest = newest_by_budget[budget]
             assert newest is not None
-            unused = self._reach.messages_from(newest.segment, budget)
-            missing = tuple(
-                self.missing[self.messages.key(m)] for m in unused if self._flow.cost[m]
-            )
+            taken = self._reach.messages_from(newest.segment, budget)
+            unused = self.messages[[m for m in taken if self._flow.cost[m]]]
+            missing = tuple(self.missing[key] for key in message_keys(unused))
         return InformationSource(
             node=node,
             sensor=node in self.scenario.placed_sensors,
             neighbour=(node, self._node) in self._links,
             heard=math.nan if last is None else float(self.messages.sent[last]),
-            arrived=math.nan if last is None else float(self.messages.arrived[last]),
+            arrived=math.nan if last is None else float(self.messages.ended[last]),
             unheard=unheard,
             known=self._replayer.at if node == self._node else known,
             reading=reading,
