@@ -17,10 +17,8 @@ from netkf.ensembles.stored import StoredEnsemble
 from netkf.linalg.arrays import FloatArray
 from netkf.report.replicas import RANKS, Replicas, choose_replica, read_replicas
 from netkf.report.worst import WorstSamples, find_worst_samples
-from netkf.runs.documents import NUMBER, TEXT, TEXTS, require_form
 from netkf.runs.stored import StoredRun, read_checked_document
 from netkf.runs.summary import PromisedTraces
-from netkf.runs.tables import COLUMNS
 from netkf.scenario.scenario import Scenario
 from netkf.studies.compare import damage_named
 from netkf.studies.opening import StoredSweep
@@ -31,16 +29,6 @@ MAX_TEXT = 200_000
 """Characters of a scenario file that a page repeats."""
 SLOT_ROUNDING = 1e-6
 """Fraction of a slot by which rounding may put the time of a sample before the slot begins."""
-ROW: dict[str, Any] = dict.fromkeys(COLUMNS, NUMBER)
-SUMMARY: dict[str, Any] = {
-    "nodes": [ROW],
-    "overall": ROW,
-    **dict.fromkeys(("limit", "central"), NUMBER),
-    "bound": TEXT,
-    "notes": TEXTS,
-    "messages": {"in_flight?": NUMBER},
-}
-"""The form of the entries of summary.json that a page reads and ``netkf.open`` does not check."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,9 +167,6 @@ def read_source(
     if (directory / "verdict.json").exists():
         with damage_named(directory):
             verdict = read_checked_document(directory, "verdict.json", VERDICT)
-    if stored.summary:
-        with damage_named(directory):
-            require_form(stored.summary, SUMMARY, "summary.json")
     ensemble = stored if isinstance(stored, StoredEnsemble) else None
     replicas = None if ensemble is None else read_replicas(ensemble)
     scenario = stored.scenario

@@ -17,6 +17,7 @@ from netkf.runs.documents import (
     NUMBER,
     SEAL,
     TEXT,
+    TEXTS,
     DamagedError,
     add_file_name,
     check_files,
@@ -26,6 +27,7 @@ from netkf.runs.documents import (
 )
 from netkf.runs.parquet_files import column_names, read_numbers, read_texts
 from netkf.runs.summary import PromisedTraces, promise_traces
+from netkf.runs.tables import COLUMNS
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES, EVENT, state_columns
@@ -33,27 +35,18 @@ from netkf.trace.schema import CODES, EVENT, state_columns
 if TYPE_CHECKING:
     import pandas as pd
 
-AVERAGES_FORM: dict[str, Any] = dict.fromkeys(
-    (
-        "rms_error",
-        "rms_error_se?",
-        "mean_sq_error?",
-        "mean_sq_error_se?",
-        "mean_trace",
-        "mean_trace_se?",
-        "mean_nees",
-        "mean_nees_se?",
-        "bound?",
-        "ratio?",
-    ),
-    NUMBER,
-)
+_OPTIONAL = ("rms_error_se?", "mean_sq_error?", "mean_sq_error_se?", "mean_trace_se?", "bound_se?")
+AVERAGES_FORM: dict[str, Any] = dict.fromkeys((*COLUMNS, *_OPTIONAL, "mean_nees_se?"), NUMBER)
 """Forms of JSON values, see documents.require_form."""
+MESSAGES = ("sent", "delivered", "lost")
 SUMMARY_FORM: dict[str, Any] = {
     "nodes": [{"node": COUNT, **AVERAGES_FORM}],
     "overall": AVERAGES_FORM,
-    "messages": {"sent": NUMBER, "delivered": NUMBER, "lost": NUMBER},
-    "rounding_from?": NUMBER,
+    **dict.fromkeys(("limit", "central", "rounding_from?"), NUMBER),
+    "bound": TEXT,
+    "notes": TEXTS,
+    "messages": {**dict.fromkeys(MESSAGES, NUMBER), "in_flight?": NUMBER},
+    "messages_se?": {f"{name}?": NUMBER for name in MESSAGES},
 }
 MANIFEST_FORM: dict[str, Any] = {
     "name": TEXT,

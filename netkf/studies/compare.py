@@ -23,10 +23,8 @@ from netkf.core.printable import list_some, shorten
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import name_rows
 from netkf.runs.documents import (
-    COUNT,
     FINAL_STATUSES,
     NUMBER,
-    TEXTS,
     DamagedError,
     add_file_name,
     check_files,
@@ -35,13 +33,12 @@ from netkf.runs.documents import (
 )
 from netkf.runs.parquet_files import column_names, read_numbers
 from netkf.runs.quantities import quantities_in
-from netkf.runs.stored import AVERAGES_FORM, MANIFEST_FORM, SUMMARY_FORM, read_checked_document
+from netkf.runs.stored import MANIFEST_FORM, MESSAGES, SUMMARY_FORM, read_checked_document
 from netkf.runs.tables import in_unit
 from netkf.scenario.writing import toml_text
 from netkf.studies.metrics import mean_over_runs
 
 AVERAGES = ("rms_error", "mean_trace", "mean_nees")
-MESSAGES = ("sent", "delivered", "lost")
 TRACES = ("bound", "limit", "central")
 PLANT = re.compile(r"plant\.|plants\.\d+\.")
 """Beginnings of the keys of plants."""
@@ -64,16 +61,6 @@ TITLES = ("name", "claim")
 """Keys of scenarios that change no run."""
 DIAGONAL = re.compile(r"P(\d+)_?\1$")
 """Columns of the diagonal of P: P11, or P1_1 where there are more than ten states."""
-ROW: dict[str, Any] = {**AVERAGES_FORM, "bound": NUMBER, "bound_se?": NUMBER}
-SUMMARY: dict[str, Any] = {
-    **SUMMARY_FORM,
-    "nodes": [{"node": COUNT, **ROW}],
-    "overall": ROW,
-    "limit": NUMBER,
-    "central": NUMBER,
-    "notes?": TEXTS,
-    "messages_se?": {f"{name}?": NUMBER for name in MESSAGES},
-}
 
 
 def quantity_label(name: str) -> str:
@@ -206,7 +193,7 @@ def read_directory(directory: Path) -> RunDirectory:
             rule = f"holds a run that did not finish ({shorten(manifest['status'], 30)})"
             raise ScenarioError(where, rule, None, "finish it with netkf run --resume")
         read_checked_document(directory, "manifest.json", MANIFEST_FORM)  # its seal
-        summary = read_checked_document(directory, "summary.json", SUMMARY)
+        summary = read_checked_document(directory, "summary.json", SUMMARY_FORM)
         name_rows(summary["nodes"])
         for row in (*summary["nodes"], summary["overall"]):
             numbers = [key for name in quantities_in(row) for key in (name, f"{name}_se")]

@@ -740,7 +740,7 @@ def test_a_summary_without_its_parts_is_refused_in_one_line(ring, tmp_path):
         ]
         del manifest["sha256"]
         write_sealed(directory / "manifest.json", manifest)
-        with pytest.raises(ScenarioError, match=f"lacks summary.json.{name}"):
+        with pytest.raises(ScenarioError, match=f"summary.json lacks {name}"):
             make_page([directory])
 
 
