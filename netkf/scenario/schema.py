@@ -44,48 +44,48 @@ USER_CLASS = "^[A-Za-z_][\\w.]*:[A-Za-z_]\\w*$"
 """Pattern of a kind that is a user's class, "package.module:Class"."""
 DEFAULT_KINDS = {"sensor": "linear"}
 """The kind of a table without the key ``kind``, by family; other families need the key."""
-NESTED_TABLES: dict[tuple[type[Component], str], Schema] = {
-    (ScenarioModel, "plant"): {"$ref": "#/$defs/plant"},
-    (Plant, "input"): {"$ref": "#/$defs/input"},
-    (ScenarioModel, "plants"): {"type": "array", "items": {"$ref": "#/$defs/block"}},
-    (ScenarioModel, "sensors"): {"type": "array", "items": {"$ref": "#/$defs/sensor"}},
-    (ScenarioModel, "network"): {"$ref": "#/$defs/network"},
-    (ScenarioModel, "filter"): {"$ref": "#/$defs/filter"},
-    (ScenarioModel, "time"): {"$ref": "#/$defs/time"},
-    (Sensor, "fault"): {"$ref": "#/$defs/fault"},
-    (ScenarioModel, "metrics"): {"$ref": "#/$defs/metrics"},
-    (Network, "graph"): {"$ref": "#/$defs/graph"},
-    (Network, "activation"): {"$ref": "#/$defs/activation"},
-    (Network, "channel"): {"$ref": "#/$defs/channel"},
-    (Network, "lives"): {"type": "array", "items": {"$ref": "#/$defs/life"}},
-    (Network, "clocks"): {"type": "array", "items": {"$ref": "#/$defs/clock"}},
-    (Network, "radio"): {"$ref": "#/$defs/radio"},
-    (Network, "quantise"): {"$ref": "#/$defs/quantisation"},
-    (Network, "energy"): {"$ref": "#/$defs/energy"},
-    (Channel, "channels"): {"$ref": "#/$defs/hopping"},
-    (Channel, "loss"): {"$ref": "#/$defs/loss"},
-    (Channel, "delay"): {"$ref": "#/$defs/delay"},
-    (Filtering, "model"): {"$ref": "#/$defs/model"},
-    (Filtering, "gate"): {"$ref": "#/$defs/gate"},
-    (Filter, "inner"): {"$ref": "#/$defs/filter"},
-    (Contacts, "clock"): {"$ref": "#/$defs/activation"},
+TABLES: dict[str, type[Component]] = {
+    "": Scenario,
+    "plants": Block,
+    "time": Time,
+    "network": Network,
+    "network.channel": Channel,
+    "network.channel.channels": Hopping,
+    "network.clocks": NodeClock,
+    "network.radio": Radio,
+    "network.quantise": Quantisation,
+    "network.energy": Energy,
+    "filter": Filtering,
+    "filter.model": Belief,
+    "filter.gate": Gate,
+    "metrics": Metrics,
 }
-"""Schemas of keys (class, key) whose values are tables of components."""
+"""Classes of the tables without a kind, or beside whose keys a kind stands, by key path."""
+KIND_TABLES: dict[tuple[type[Component], str], str] = {
+    (ScenarioModel, "plant"): "plant",
+    (ScenarioModel, "sensors"): "sensor",
+    (Plant, "input"): "input",
+    (Sensor, "fault"): "fault",
+    (Network, "graph"): "graph",
+    (Network, "activation"): "activation",
+    (Network, "lives"): "life",
+    (Channel, "loss"): "loss",
+    (Channel, "delay"): "delay",
+    (Filter, "inner"): "filter",
+    (Contacts, "clock"): "activation",
+}
+"""The families of tables with a kind, by class and key."""
+LISTS = ("plants", "sensors", "lives", "clocks")
+"""Keys of lists of tables."""
 SAMPLING: Schema = {"anyOf": [{"const": "continuous"}, {"$ref": "#/$defs/sampling"}]}
 FAMILIES = {
-    "plant": ("plant", "continuous plant"),
-    "input": ("input",),
-    "sensor": ("sensor",),
-    "sampling": ("sampling",),
-    "fault": ("fault",),
-    "graph": ("graph",),
-    "activation": ("activation", "slot activation"),
-    "life": ("life",),
-    "loss": ("loss",),
-    "delay": ("delay",),
-    "filter": ("filter",),
+    name: tuple(f for f in KINDS if f.rpartition(" ")[2] == name and f != "slot filter")
+    for name in KINDS
+    if " " not in name
 }
-"""The families of registry.KINDS that a table can belong to, by the table's name in ``$defs``."""
+"""The families of registry.KINDS that a table can belong to, by the table's name in ``$defs``; all
+filters are of the family "filter".
+"""
 
 
 class TableKey(NamedTuple):
@@ -117,18 +117,11 @@ def scenario_schema() -> Schema:
     file_schema["oneOf"] = [{"required": ["plant"]}, {"required": ["plants"]}]
     file_schema["required"] = ["format", *required]
     definitions = {name: _family_schema(name, families) for name, families in FAMILIES.items()}
-    definitions["block"] = _block_schema()
-    definitions["network"] = _table_schema(list_keys(Network))
-    definitions["channel"] = _table_schema(list_keys(Channel))
-    definitions["gate"] = _table_schema(list_keys(Gate))
-    definitions["clock"] = _table_schema(list_keys(NodeClock))
-    definitions["quantisation"] = _table_schema(list_keys(Quantisation))
-    definitions["radio"] = _table_schema(list_keys(Radio))
-    definitions["energy"] = _table_schema(list_keys(Energy))
-    definitions["hopping"] = _table_schema(list_keys(Hopping))
-    definitions["time"] = _table_schema(list_keys(Time))
-    definitions["metrics"] = _table_schema(list_keys(Metrics))
-    definitions["model"] = _table_schema(list_keys(Belief))
+    definitions["plants"] = _block_schema()
+    for path, cls in TABLES.items():
+        name = path.rpartition(".")[2]
+        definitions.setdefault(name, _table_schema(list_keys(cls)))
+    del definitions[""]
     return {
         "$schema": DIALECT,
         "title": "netkf scenario",
@@ -162,9 +155,12 @@ def list_keys(cls: type[Component]) -> list[TableKey]:
 def _nested_table_schema(cls: type[Component], key: str) -> Schema | None:
     if key == "sampling":
         return SAMPLING
-    for (owner, name), schema in NESTED_TABLES.items():
+    plain = {(TABLES[path.rpartition(".")[0]], path.rpartition(".")[2]) for path in TABLES if path}
+    names = KIND_TABLES | {(owner, name): name for owner, name in plain}
+    for (owner, name), definition in names.items():
         if issubclass(cls, owner) and name == key:
-            return schema
+            table = {"$ref": f"#/$defs/{definition}"}
+            return {"type": "array", "items": table} if key in LISTS else table
     return None
 
 

@@ -4,42 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from netkf.algorithms.gates import Gate
 from netkf.core.fields import Component
-from netkf.network.channels import Channel
-from netkf.network.energy import Energy
-from netkf.network.node_clocks import NodeClock
-from netkf.network.quantise import Quantisation
-from netkf.network.radio import Radio
-from netkf.network.scheduled import Hopping
-from netkf.plants.blocks import Block
-from netkf.scenario.metrics import Metrics
-from netkf.scenario.model import Belief, Filtering, Network
 from netkf.scenario.registry import KINDS
-from netkf.scenario.scenario import Scenario
-from netkf.scenario.schema import TableKey, list_keys, summary
-from netkf.scenario.stamps import Time
+from netkf.scenario.schema import TABLES, TableKey, list_keys, summary
 from netkf.scenario.writing import part_as_table, toml_text
 
-TABLES: dict[str, type[Component]] = {
-    "The file": Scenario,
-    "plants, beside the keys of its plant": Block,
-    "time": Time,
-    "network": Network,
-    "network.channel": Channel,
-    "network.channel.channels": Hopping,
-    "network.clocks": NodeClock,
-    "network.radio": Radio,
-    "network.quantise": Quantisation,
-    "network.energy": Energy,
-    "filter, beside its kind": Filtering,
-    "filter.model": Belief,
-    "filter.gate": Gate,
-    "metrics": Metrics,
+HEADINGS = {
+    "": "The file",
+    "plants": "plants, beside the keys of its plant",
+    "filter": "filter, beside its kind",
 }
-"""Classes of the tables without a kind, by heading."""
-INNER = ((Filtering, "algorithm"), (Block, "plant"))
-"""Fields whose keys stand beside those of the table."""
+"""Headings of tables without a kind whose key paths do not say all."""
 SECTIONS = {
     "plant": "plant.kind",
     "continuous plant": "plant.kind in continuous time, with A and B",
@@ -67,13 +42,11 @@ def _iterate_page_lines() -> Iterator[str]:
     yield "# Keys of scenario files"
     yield ""
     yield "`netkf schema --markdown` prints this page. Keys whose default is a dash must be given."
-    for heading, cls in TABLES.items():
-        keys = [
-            key
-            for key in list_keys(cls)
-            if (cls, key.name) not in ((Filtering, "algorithm"), (Block, "plant"))
-        ]
-        yield from ("", f"## {heading}", "", summary(cls), "")
+    for path, cls in TABLES.items():
+        # Keys of these fields stand beside those of the table.
+        inner = {"filter": "algorithm", "plants": "plant"}.get(path)
+        keys = [key for key in list_keys(cls) if key.name != inner]
+        yield from ("", f"## {HEADINGS.get(path, path)}", "", summary(cls), "")
         yield from _iterate_table_lines(keys)
     for family, heading in SECTIONS.items():
         yield from ("", f"## {heading}")
