@@ -16,6 +16,7 @@ from netkf.algorithms.kernels.run import absorb as nothing
 from netkf.core.clock import stated_rate
 from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.fields import Component
+from netkf.core.printable import list_some
 from netkf.linalg.spectra import growth_rate
 from netkf.network.clocks import LinkClock
 from netkf.network.losses import GilbertElliott
@@ -178,7 +179,7 @@ def _check_sensors(scenario: DerivedScenario) -> None:
             require_shape(f"{key}.R", sensor.R, (p, p), f"H has {p} rows")
         for position, node in enumerate(sensor.nodes):
             if node not in index_of_node:
-                remedy = f"node ids here are {_list_ids(scenario.nodes)}"
+                remedy = f"node ids here are {list_some(scenario.nodes, 8)}"
                 if node in scenario.topology.left_out:
                     why = "none of its links reaches network.graph.minimum, lower that"
                     remedy = f"{why}; {remedy}"
@@ -222,10 +223,6 @@ def _check_speed(scenario: DerivedScenario) -> None:
             A,
             "shorten the horizon",
         )
-
-
-def _list_ids(nodes: tuple[int, ...]) -> str:
-    return ", ".join(map(str, nodes)) if len(nodes) <= 8 else f"{nodes[0]} .. {nodes[-1]}"
 
 
 def _check_owners(scenario: DerivedScenario, name: str, entries: Sequence[Any]) -> None:

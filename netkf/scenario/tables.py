@@ -163,9 +163,8 @@ def _build(cls: type[S], table: Mapping[str, Any], origin: Origin) -> Any:
     if "plants" in values and "plant" in values:
         rule = "cannot stand beside [[plants]]"
         raise ScenarioError("plant", rule, None, "write one of the two")
-    plant_builders = {"plant": _build_plant, "plants": _build_blocks}
-    builders = {key: partial(builder, origin) for key, builder in plant_builders.items()}
-    values = _build_inner(values, builders)
+    blocks = partial(_build_list, "plants", partial(_build_block, origin))
+    values = _build_inner(values, {"plant": partial(_build_plant, origin), "plants": blocks})
     plant = values.get("plant")
     if "plants" in values:
         plant, values["plant"] = values["plants"][0].plant, None
@@ -286,15 +285,6 @@ def _build_plant(origin: Origin, value: Any) -> Any:
     return _build_component("continuous plant" if continuous else "plant", origin, table)
 
 
-def _build_blocks(origin: Origin, value: Any) -> tuple[Any, ...]:
-    if not isinstance(value, (list, tuple)) or not value:
-        raise ScenarioError("", "must be a list of tables", value, "write [[plants]]")
-    tables = {f"[{k}]": item for k, item in enumerate(value)}
-    return tuple(
-        _build_inner(tables, dict.fromkeys(tables, partial(_build_block, origin))).values()
-    )
-
-
 def _build_block(origin: Origin, value: Any) -> Any:
     if isinstance(value, Block):
         return value
@@ -350,7 +340,7 @@ def _as_dict(value: Any) -> dict[str, Any]:
 
 
 def _build_list(key: str, build: Callable[[Any], Any], value: Any) -> tuple[Any, ...]:
-    if not isinstance(value, (list, tuple)):
+    if not isinstance(value, (list, tuple)) or (key == "plants" and not value):
         raise ScenarioError("", "must be a list of tables", value, f"write [[{key}]]")
     tables = {f"[{k}]": item for k, item in enumerate(value)}
     return tuple(_build_inner(tables, dict.fromkeys(tables, build)).values())

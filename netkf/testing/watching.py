@@ -8,12 +8,10 @@ import functools
 import inspect
 import pickle
 import random
-import struct
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from operator import attrgetter
-from typing import Any, NoReturn, cast
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -170,33 +168,11 @@ def global_generator_states() -> tuple[Any, Any]:
     """Return the states of the global generators of Python and numpy, for comparisons."""
     shared = np.random.get_bit_generator()  # type: ignore[attr-defined]
     if not isinstance(shared, np.random.MT19937):
-        return _python_generator_state(), repr(shared.state)
+        return random.getstate(), repr(shared.state)
     # Copied from memory: numpy takes 0.1 ms to list the state, and this function runs before and
     # after each call of a user's method.
     words = ctypes.string_at(shared.ctypes.state_address, MERSENNE_BYTES)
-    return _python_generator_state(), (id(shared), words)
-
-
-def _python_generator_state() -> Any:
-    address = _python_state_address()
-    if address is None:
-        return random.getstate()
-    # getstate would list 625 numbers, which with their comparison takes most of a check.
-    return ctypes.string_at(address, MERSENNE_BYTES), _python_generator().gauss_next
-
-
-def _python_generator() -> Any:
-    return cast(Any, random.getstate).__self__
-
-
-@functools.cache
-def _python_state_address() -> int | None:
-    header, size = object.__basicsize__, random.Random.__basicsize__
-    if sys.implementation.name != "cpython" or size < header + MERSENNE_BYTES:
-        return None
-    address = id(_python_generator()) + header
-    position, *words = struct.unpack("=625I", ctypes.string_at(address, MERSENNE_BYTES))
-    return address if random.getstate()[1] == (*words, position) else None
+    return random.getstate(), (id(shared), words)
 
 
 @functools.cache
