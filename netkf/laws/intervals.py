@@ -186,15 +186,15 @@ def _binomial_shift(p: float, trials: int, level: float) -> float:
 
 def _binomial_rise(p: float, trials: int, level: float) -> float:
     """Return by how much a probability must exceed ``p`` to be found; nan if it never is."""
-    # The least number of successes that has at most the probability level / 2: by bisection.
-    low, high = 0, trials + 1
-    while high - low > 1:
-        middle = (low + high) // 2
-        tail = float(scipy.special.betainc(middle, trials - middle + 1, p))
-        low, high = (low, middle) if tail <= 0.5 * level else (middle, high)
-    if high > trials:
+    # The least number of successes that has at most the probability level / 2.
+    many = min(trials, 1 + math.ceil(scipy.special.bdtrik(1.0 - 0.5 * level, trials, p)))
+    while many > 1 and scipy.special.betainc(many - 1, trials - many + 2, p) <= 0.5 * level:
+        many -= 1
+    while many <= trials and scipy.special.betainc(many, trials - many + 1, p) > 0.5 * level:
+        many += 1
+    if many > trials:
         return math.nan
-    return float(scipy.special.betaincinv(high, trials - high + 1, POWER)) - p
+    return float(scipy.special.betaincinv(many, trials - many + 1, POWER)) - p
 
 
 def with_drawn(interval: Interval, sample_factor: Callable[[float], float]) -> Interval:

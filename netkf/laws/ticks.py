@@ -215,8 +215,9 @@ def rates_of_each(
 ) -> list[Interval]:
     """Return intervals, together at ``level``, of relative errors of rates of E clocks."""
     expected, single = group.rates * horizon, level / len(group.rates)
+    poisson = group.poisson
     return [
-        count_interval(counts[:, k], float(mean), single, group.poisson, float(slack[k]))
+        count_interval(counts[:, k], float(mean), single, poisson, float(slack[k]))
         for k, mean in enumerate(expected)
     ]
 

@@ -83,7 +83,7 @@ def _tables_fault(run: Run, stored: StoredRun) -> str:
         ("sq_error", stored.sq_error, square),
         ("nees", np.where(np.isnan(nees), np.nan, stored.nees), nees),
     ):
-        if not _equal(seen, expected):
+        if not np.allclose(seen, expected, rtol=FILE_TOLERANCE, atol=0.0, equal_nan=True):
             return f"states.parquet: {name} is not that of errors and P"
     return ""
 
@@ -100,10 +100,11 @@ def _squares(run: Run) -> tuple[FloatArray, FloatArray]:
         return (e**2).sum(axis=2), np.where(usable, (e * solved).sum(axis=2), np.nan)
 
 
-def _equal(seen: Any, expected: Any) -> bool:
+def _is_close(seen: float | None, expected: float) -> bool:
     """Return True if numbers are equal up to rounding; nan equals nan, and None is nan."""
-    one, other = (np.asarray(value, dtype=np.float64) for value in (seen, expected))
-    return bool(np.allclose(one, other, rtol=FILE_TOLERANCE, atol=0.0, equal_nan=True))
+    if seen is None or math.isnan(seen):
+        return math.isnan(expected)
+    return math.isclose(seen, expected, rel_tol=FILE_TOLERANCE)
 
 
 def _summary_fault(run: Run, stored: StoredRun) -> str:
@@ -167,10 +168,10 @@ def _averages_fault(run: Run, summary: dict[str, Any], rows: dict[int, Any]) -> 
             value = float(values.mean() if place is None else values[place])
             value = math.sqrt(value) if name == "rms_error" else value
             unknown = name == "mean_nees" and math.isnan(value)
-            if not unknown and not _equal(row[name], value):
+            if not unknown and not _is_close(row[name], value):
                 return f"summary.json: {name} of {who} {row[name]}, not {value:.9g}"
         ratio = None if row.get("bound") is None else row["mean_trace"] / row["bound"]
-        if ratio is not None and not _equal(row["ratio"], ratio):
+        if ratio is not None and not _is_close(row["ratio"], ratio):
             return f"summary.json: ratio of {who} {row['ratio']}, not {ratio:.9g}"
     return ""
 

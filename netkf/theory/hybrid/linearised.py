@@ -79,25 +79,19 @@ def _solve_by_gmres(
 ) -> FloatArray | None:
     """Return X (N, m) of ``L(X) = -right`` by refined GMRES; None if it diverges."""
     try:
-        solve_alone, solve_shared = _inverses(linear)
+        roughly_inverse = _rough_inverse(linear)
     except np.linalg.LinAlgError:
         return None
 
-    def apply(x: FloatArray) -> FloatArray:
-        """Return L(x) (N m,) for a vector x (N m,)."""
-        X = x.reshape(right.shape)
-        return np.asarray(linear.remaining(X) + linear.arriving(X)).reshape(-1)
+    def as_operator(rows: Rows) -> scipy.sparse.linalg.LinearOperator:
+        """Return the operator on vectors (N m,) that ``rows`` is on rows (N, m)."""
+        return scipy.sparse.linalg.LinearOperator(
+            (right.size, right.size),
+            matvec=lambda x: rows(x.reshape(right.shape)).reshape(-1),
+            dtype=np.float64,
+        )
 
-    def precondition(x: FloatArray) -> FloatArray:
-        """Return ``L^-1 x`` (N m,) roughly: a change that all nodes share, then each node alone."""
-        shared = np.tile(solve_shared(x.reshape(right.shape).mean(axis=0)), len(right))
-        return shared + solve_alone((x - apply(shared)).reshape(right.shape)).reshape(-1)
-
-    shape = (right.size, right.size)
-    operator = scipy.sparse.linalg.LinearOperator(shape, matvec=apply, dtype=np.float64)
-    preconditioner = scipy.sparse.linalg.LinearOperator(
-        shape, matvec=precondition, dtype=np.float64
-    )
+    operator, preconditioner = as_operator(linear.change), as_operator(roughly_inverse)
     # Iterative refinement: each round solves for the residual that the last one left.
     x, residual, size = np.zeros(right.size), -right.reshape(-1), float(np.linalg.norm(right))
     for _ in range(ROUNDS):
@@ -112,31 +106,43 @@ def _solve_by_gmres(
         if failed or not np.isfinite(step).all():
             return None
         x = x + step
-        residual = -right.reshape(-1) - apply(x)
+        residual = -right.reshape(-1) - operator @ x
         if np.linalg.norm(residual) <= tolerance * size:
             break
     return np.asarray(x).reshape(right.shape)
 
 
-def _inverses(linear: LinearisedRiccati) -> tuple[Rows, Rows]:
-    """Return inverses of rows (N, m) by themselves, and of the mean of nodes; or LinAlgError."""
+def _rough_inverse(linear: LinearisedRiccati) -> Rows:
+    """Return roughly ``L^-1`` of rows X (N, m), or LinAlgError: a change that all nodes share,
+    then each node alone.
+    """
     packed, n = linear.packed, linear.drifts.shape[1]
     if n <= MAX_PACKED:
-        inverse, coarse = np.linalg.inv(linear.blocks), np.linalg.inv(linear.mean_map())
-        return (lambda X: np.einsum("ik,ikl->il", X, inverse)), (lambda x: x @ coarse)
+        shared, inverse = linear.shared_map, np.linalg.inv(linear.blocks)
+        coarse = np.linalg.inv(shared.mean(axis=0))
+        # What is left of a shared row c after each node alone: c - (c L) L_i^-1.
+        rest = np.eye(packed.m) - shared @ inverse
+        rest = np.moveaxis(rest, 1, 0).reshape(packed.m, -1)
+
+        def solve(X: FloatArray) -> FloatArray:
+            alone = np.einsum("ik,ikl->il", X, inverse)
+            return np.asarray(alone + (X.mean(axis=0) @ coarse @ rest).reshape(X.shape))
+
+        return solve
     # m^3 operations are too many: Lyapunov equations take n^3. They leave out what samples add to
     # drifts, and what the prediction over a delay changes.
     kinds, kind = np.unique(linear.drifts.reshape(-1, n * n), axis=0, return_inverse=True)
     solvers = [_lyapunov_solver(F.reshape(n, n)) for F in kinds]
     arriving = sum(float(rates.sum()) for rates, _, _ in linear.heard) / len(linear.drifts)
-    shared = _lyapunov_solver(linear.drifts.mean(axis=0) + 0.5 * arriving * np.eye(n))
+    solve_shared = _lyapunov_solver(linear.drifts.mean(axis=0) + 0.5 * arriving * np.eye(n))
 
-    def solve_alone(X: FloatArray) -> FloatArray:
-        return packed.pack(
-            np.stack([solvers[k](R) for k, R in zip(kind, packed.unpack(X), strict=True)])
-        )
+    def solve_wide(X: FloatArray) -> FloatArray:
+        shared = np.tile(packed.pack(solve_shared(packed.unpack(X.mean(axis=0)))), (len(X), 1))
+        rest = packed.unpack(X - linear.change(shared))
+        alone = [solvers[k](R) for k, R in zip(kind, rest, strict=True)]
+        return np.asarray(shared + packed.pack(np.stack(alone)))
 
-    return solve_alone, lambda x: packed.pack(shared(packed.unpack(x)))
+    return solve_wide
 
 
 def _lyapunov_solver(F: FloatArray) -> Rows:

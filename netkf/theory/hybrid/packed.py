@@ -255,14 +255,20 @@ class LinearisedRiccati:
             total += rates @ sent
         return total
 
-    def mean_map(self) -> FloatArray:
-        """Return the mean map (m, m) of rows that are equal everywhere, to precondition."""
-        total = self.blocks.mean(axis=0)
+    def change(self, X: FloatArray) -> FloatArray:
+        """Return what rows X (N, m) change per second, (N, m)."""
+        return np.asarray(self.remaining(X) + self.arriving(X))
+
+    @cached_property
+    def shared_map(self) -> FloatArray:
+        """The map (N, m, m) of a row that all nodes share."""
+        total = self.blocks.copy()
         for rates, _, maps in self.heard:
-            # the rate at which each sender is heard, over the number of nodes
-            rate = np.asarray(rates.sum(axis=0)).reshape(-1) / len(self.blocks)
-            total += rate.sum() * maps[0] if len(maps) == 1 else np.tensordot(rate, maps, 1)
-        return np.asarray(total)
+            if len(maps) == 1:
+                total += np.asarray(rates.sum(axis=1)).reshape(-1, 1, 1) * maps
+            else:
+                total += (rates @ maps.reshape(len(maps), -1)).reshape(total.shape)
+        return total
 
     def full_matrix(self) -> FloatArray:
         """Return the map as a full matrix (N m, N m), with the arrivals."""

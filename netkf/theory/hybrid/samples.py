@@ -108,14 +108,15 @@ def transmits_at_samples(scenario: Scenario) -> bool:
 
 def _mean_link_weights(scenario: Scenario) -> SparseOrFull:
     """Return delivery times weight (receivers, senders) of messages sent at samples."""
-    index = scenario.topology.index
-    weights: Any = full_matrix(len(index), len(index))
+    index, talks = scenario.topology.index, scenario.filter.algorithm.timing.talks
+    ways = scenario.topology.directions if talks and transmits_at_samples(scenario) else ()
+    values = [scenario.mean_delivery((i, j)) * scenario.weight(j, i) for i, j in ways]
+    places = [index[j] for _, j in ways], [index[i] for i, _ in ways]
     if len(index) > MAX_FULL:
-        weights = scipy.sparse.lil_array(weights.shape)
-    if scenario.filter.algorithm.timing.talks and transmits_at_samples(scenario):
-        for i, j in scenario.topology.directions:
-            weights[index[j], index[i]] = scenario.mean_delivery((i, j)) * scenario.weight(j, i)
-    return weights if isinstance(weights, FullMatrix) else scipy.sparse.csr_array(weights)
+        return scipy.sparse.csr_array((values, places), shape=(len(index), len(index)), dtype=float)
+    weights = full_matrix(len(index), len(index))
+    weights[places] = values
+    return weights
 
 
 def poisson_samples(scenario: Scenario) -> tuple[PoissonSamples, ...]:
