@@ -55,14 +55,10 @@ def from_control(
     if not all(hasattr(space, name) for name in ("A", "B", "C", "D", "dt")):
         remedy = "give control.ss(system), or one of scipy.signal.StateSpace"
         raise ScenarioError("system", "must be a state space", type(system).__name__, remedy)
-    A, B, C = (matrix(name, np.asarray(getattr(space, name))) for name in "ABC")
+    A, C = (matrix(name, np.asarray(getattr(space, name))) for name in "AC")
     gain = np.eye(len(A)) if G is None else _shaped("G", matrix("G", np.atleast_2d(G)), len(A))
     hint = "correct it" + ", or give G = system.B for noise at the inputs" * (G is None)
     noise = _shaped("Q", covariance("Q", np.atleast_2d(Q)), gain.shape[1], hint)
-    if np.any(space.D) and any(key.startswith("plant.input") for key in require_changes(changes)):
-        rule = "feeds the input through to the readings, which netkf does not"
-        remedy = "subtract D u from the outputs and set D = 0"
-        raise ScenarioError("system.D", rule, np.asarray(space.D), remedy)
     named = str(getattr(system, "name", None) or "")
     table: dict[str, Any] = {"name": named if named and "[" not in named else "system"}
     if space.dt is None or (space.dt == 0 and space.dt is not False):
@@ -74,7 +70,12 @@ def from_control(
     else:
         table |= _slots(1.0 if space.dt is True else space.dt)
         table["plant"] |= {"F": A, "Q": gain @ noise @ gain.T}
-    return _scenario(table, C, R, B, changes)
+    scenario = _scenario(table, C, R, space.B, changes)
+    if np.any(space.D) and getattr(scenario.plant, "input", None) is not None:
+        rule = "feeds the input through to the readings, which netkf does not"
+        remedy = "subtract D u from the outputs and set D = 0"
+        raise ScenarioError("system.D", rule, np.asarray(space.D), remedy)
+    return scenario
 
 
 def from_filterpy(kf: Any, changes: Changes = None, *, period: float = 1.0) -> Scenario:
@@ -105,7 +106,8 @@ def from_filterpy(kf: Any, changes: Changes = None, *, period: float = 1.0) -> S
         "mean": vector("kf.x", np.ravel(kf.x)),
         "cov": covariance("kf.P", np.atleast_2d(kf.P)),
     }
-    return _scenario(table, matrix("kf.H", np.atleast_2d(kf.H)), kf.R, kf.B, changes)
+    H = matrix("kf.H", np.atleast_2d(kf.H))
+    return _scenario(table, H, kf.R, getattr(kf, "B", None), changes)
 
 
 def _shaped(key: str, value: FloatArray, rows: int, hint: str = "correct it") -> FloatArray:
@@ -134,8 +136,9 @@ def _scenario(table: dict[str, Any], H: FloatArray, R: Any, B: Any, changes: Cha
         "network": {"graph": {"kind": "complete", "nodes": len(rows)}},
         "filter": {"kind": "central"},
     }
-    changes = dict(require_changes(changes))
-    u = changes.get("plant.input")
-    if isinstance(u, Mapping) and "G" not in u and B is not None:
-        changes["plant.input"] = {**u, "G": np.asarray(B, dtype=np.float64)}
-    return from_table(change_table(table, changes), Path.cwd())
+    table = change_table(table, require_changes(changes))
+    plant = table["plant"]
+    u = plant.get("input") if isinstance(plant, Mapping) else None
+    if isinstance(u, Mapping) and B is not None:
+        table["plant"] = {**plant, "input": {"G": np.asarray(B), **u}}
+    return from_table(table, Path.cwd())

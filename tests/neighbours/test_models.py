@@ -1,5 +1,7 @@
 """Scenarios of python-control, scipy.signal and filterpy, against their own filters."""
 
+from types import SimpleNamespace
+
 import networkx
 import numpy as np
 import pytest
@@ -52,6 +54,8 @@ def test_scipy_systems_and_a_network():
     np.testing.assert_allclose(run.x, x, atol=1e-12)  # without noise, the response to the input
     transfer = signal.dlti([1.0], [1.0, -0.5], dt=0.1)
     assert netkf.from_control(transfer, 1.0, 1.0).plant.F.tolist() == [[0.5]]
+    alone = signal.StateSpace(A, np.zeros((2, 0)), C, np.zeros((2, 0)))
+    assert netkf.from_control(alone, np.eye(2), R).plant.A.tolist() == A.tolist()  # no inputs
     correlated = netkf.from_control(system, np.eye(2), [[1.0, 0.3], [0.3, 1.0]])
     assert [len(sensor.R) for sensor in correlated.sensors] == [2]
 
@@ -98,10 +102,13 @@ def test_a_run_of_a_filterpy_filter_is_that_filter():
         (lambda: netkf.from_control(SYSTEM, np.eye(2), R, {"horizn": 1}), "horizn: is not a key"),
         (
             lambda: netkf.from_control(
-                signal.StateSpace(A, B, C, np.ones((2, 1))),
-                np.eye(2),
-                R,
-                {"plant.input": {"kind": "constant", "value": [1.0]}},
+                through(), np.eye(2), R, {"plant.input.kind": "constant", "plant.input.value": [1]}
+            ),
+            "system.D: feeds the input through",
+        ),
+        (
+            lambda: netkf.from_control(
+                through(), np.eye(2), R, {"plant": netkf.parts.Diffusion(A, B, input=INPUT)}
             ),
             "system.D: feeds the input through",
         ),
@@ -119,6 +126,24 @@ def test_what_is_no_model_is_refused_in_one_line(call, message):
 
 
 SYSTEM = signal.StateSpace(A, B, C, np.zeros((2, 1)))
+INPUT = netkf.parts.ConstantInput(G=B, value=[1.0])
+
+
+def through():
+    return signal.StateSpace(A, B, C, np.ones((2, 1)))
+
+
+def test_inputs_have_the_matrix_of_the_model_however_changes_state_them():
+    for kind in (
+        {"plant.input.kind": "constant", "plant.input.value": [1.0]},
+        {"plant.input": {"kind": "constant", "value": [1.0]}},
+        {"plant.input": INPUT},
+    ):
+        scenario = netkf.from_control(SYSTEM, np.eye(2), R, kind)
+        assert scenario.plant.input.G.tolist() == B.tolist()
+    assert netkf.from_control(through(), np.eye(2), R, {"plant.input": None}).plant.input is None
+    kf = SimpleNamespace(F=A, Q=np.eye(2), H=C, R=R, x=np.zeros(2), P=np.eye(2))  # no B
+    assert netkf.from_filterpy(kf).plant.input is None
 
 
 def frequencies():
