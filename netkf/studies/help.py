@@ -10,7 +10,7 @@ import numpy as np
 from netkf.core.errors import NetkfError
 from netkf.runs.tables import format_number
 from netkf.scenario.scenario import Scenario
-from netkf.studies.metrics import central_trace
+from netkf.studies.metrics import central_traces
 from netkf.studies.targets import Target, quantity_by_theory
 
 STEP = 1.1
@@ -28,10 +28,11 @@ def describe_help(scenario: Scenario, target: Target, searched: str) -> str:
     if target.of_runs:
         return ""
     try:
-        trace = central_trace(scenario)
+        traces = central_traces(scenario)
     except NetkfError:
         return ""
     has_roots = target.of_errors and target.quantity != "within_central"
+    trace = float(traces.max() if target.of_worst else traces.mean())
     value = math.sqrt(trace) if target.of_errors else trace
     name = "RMS error" if target.of_errors else "trace of P"
     sentence = f"a centralised filter has {name} {format_number(value)} there"

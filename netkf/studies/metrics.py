@@ -170,10 +170,10 @@ def bound_traces(scenario: Scenario) -> FloatArray:
     return time_average(scenario, np.stack(columns, axis=1))
 
 
-def central_trace(scenario: Scenario) -> float:
-    """Return the trace of P of a filter with all readings and the true model, averaged over time
-    and over what nodes estimate. Raises TheoryError if readings are recorded or missing, their
-    times or H random.
+def central_traces(scenario: Scenario) -> FloatArray:
+    """Return the traces (N,) of P of a filter with all readings and the true model, of what each
+    node estimates, averaged over time. Raises TheoryError if readings are recorded or missing,
+    their times or H random.
     """
     if randomly_sampled_sensors(scenario):
         raise TheoryError("sensors sample at random times: the central filter has a bound, no P")
@@ -185,9 +185,16 @@ def central_trace(scenario: Scenario) -> float:
         P = _slot_covariances(scenario, 0, scenario.plant.start_cov, central.model_pieces)
     else:
         P = covariance_bound(central, scenario.times)[:, 0]
-    views = [slice(None)] if scenario.views is None else scenario.views
-    columns = [traces(P[:, view][:, :, view]) for view in views]
-    return float(time_average(scenario, np.stack(columns, axis=1)).mean())
+    if scenario.views is None:
+        return np.repeat(time_average(scenario, traces(P)[:, None]), len(scenario.nodes))
+    columns = [traces(P[:, view][:, :, view]) for view in scenario.views]
+    return time_average(scenario, np.stack(columns, axis=1))
+
+
+def over_central(squares: FloatArray, central: FloatArray) -> FloatArray:
+    """Return mean ``squares`` (..., N) over the ``central_traces`` (N,), 0 where both are 0."""
+    nothing = np.where(squares > 0.0, np.inf, 0.0)
+    return np.divide(squares, central, out=nothing, where=central > 0.0)
 
 
 def _require_fixed_H(scenario: Scenario) -> None:

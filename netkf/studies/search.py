@@ -16,7 +16,7 @@ from netkf.ensembles.replicas import replicate_blocks
 from netkf.runs.quantities import ensemble_names
 from netkf.scenario.scenario import Scenario
 from netkf.studies.help import BEYOND, describe_help
-from netkf.studies.metrics import METRICS, central_trace, join_metrics
+from netkf.studies.metrics import METRICS, central_traces, join_metrics
 from netkf.studies.targets import (
     MISSED,
     NOT_SHOWN,
@@ -245,8 +245,8 @@ class Search:
         """Return the probe of a ``value``: runs are doubled until its interval decides."""
         plan, scenario, target = self.plan, self.at(value), self.target
         assert plan is not None
-        # This target divides by the trace of P of a filter with all readings.
-        central = central_trace(scenario) if target.quantity == "within_central" else None
+        # This target divides by the traces of P of a filter with all readings.
+        central = central_traces(scenario) if target.quantity == "within_central" else None
         simulated, metrics = 0, []
         say = plan.progress or (lambda _: None)
         say(f"{self.key} = {value:g}: simulating")

@@ -50,9 +50,9 @@ def size(
 ) -> Sizing:
     """Search ``key`` between ``low`` and ``high`` for the value that just reaches ``target``, such
     as ``"worst_rms<=0.5"``; quantities are worst_rms, mean_rms, worst_trace, mean_trace and
-    within_central, the largest RMS error over that of a filter with all readings, and by simulation
-    those of summaries over all nodes: worst_instant, quantile_99 and its kind, time_above,
-    mean_age, worst_age, ``time_connected>=0.95``, transmissions, bytes, joules.
+    within_central, the largest RMS error over that of a filter with all readings of these states,
+    and by simulation those of summaries over all nodes: worst_instant, quantile_99 and its kind,
+    time_above, mean_age, worst_age, ``time_connected>=0.95``, transmissions, bytes, joules.
 
     ``by`` is "theory" (a bound on the quantity, or its exact value), "simulation", or None: the
     exact value where it is known; else the bound where that reaches the target, and simulation

@@ -35,7 +35,7 @@ from netkf.studies.metrics import (
     all_nodes,
     block_metrics,
     bound_traces,
-    central_trace,
+    central_traces,
     join_metrics,
     mean_over_runs,
     square_root_of,
@@ -156,7 +156,7 @@ def _make_row(point: GridPoint, metrics: RunMetrics) -> Row:
     for name, (value, error) in quantities.items():
         row |= {name: value, f"{name}_se": error}
     row["bound"] = _value_or_nan(lambda: float(bound_traces(point.scenario).mean()))
-    row["central"] = _value_or_nan(lambda: central_trace(point.scenario))
+    row["central"] = _value_or_nan(lambda: float(central_traces(point.scenario).mean()))
     sent, delivered, lost = metrics.messages[:, :3].mean(axis=0).tolist()
     row |= {"sent": sent, "delivered": delivered, "lost": lost}
     diverged, blurred = int(metrics.diverged.sum()), float(metrics.rounding_from.min())

@@ -12,9 +12,10 @@ import numpy as np
 import scipy
 
 from netkf.core.errors import ScenarioError, TheoryError
+from netkf.linalg.arrays import FloatArray
 from netkf.runs.quantities import NETWORK
 from netkf.scenario.scenario import Scenario
-from netkf.studies.metrics import RunMetrics, bound_traces, central_trace
+from netkf.studies.metrics import RunMetrics, bound_traces, central_traces, over_central
 from netkf.theory import assumptions
 from netkf.theory.hybrid.samples import randomly_sampled_sensors
 
@@ -25,7 +26,7 @@ AVERAGES = {
     "mean_rms": "RMS error of all nodes together",
     "worst_trace": "mean trace of P of the node with the largest",
     "mean_trace": "mean trace of P of all nodes",
-    "within_central": "RMS error of the node with the largest over that of a centralised filter",
+    "within_central": "largest of the nodes' RMS errors, each over that of a centralised filter",
 }
 """Quantities of a target that are averages over the samples after time 0."""
 QUANTITIES = AVERAGES | {
@@ -87,7 +88,9 @@ class Target(NamedTuple):
         return UNDECIDED if (high >= self.limit if self.least else low <= self.limit) else MISSED
 
     def prepare(self, scenario: Scenario) -> Scenario:
-        """Return a scenario whose runs have the quantity; raises ScenarioError if none has."""
+        """Return a scenario whose runs have the quantity; raises ScenarioError if none has, and
+        TheoryError where the central filter has no P.
+        """
         metrics = scenario.metrics
         quantile = QUANTILE.fullmatch(self.quantity)
         if quantile:
@@ -98,6 +101,13 @@ class Target(NamedTuple):
         elif self.quantity == "joules" and scenario.network.energy is None:
             rule, remedy = "needs network.energy", "add joules_per_packet to [network.energy]"
             raise ScenarioError("--target", rule, self.quantity, remedy)
+        elif self.quantity == "within_central":
+            try:
+                central_traces(scenario)
+            except TheoryError as error:
+                rule = f"--target: within_central divides by P of a centralised filter: {error}"
+                remedy = "ask for worst_rms; netkf compare-filters has the errors of both"
+                raise TheoryError(f"{rule}; {remedy}") from None
         elif self.quantity in NETWORK:
             metrics = dataclasses.replace(metrics, network=True)
         return dataclasses.replace(scenario, metrics=metrics)
@@ -144,9 +154,9 @@ def quantity_by_theory(scenario: Scenario, target: Target) -> tuple[float, str]:
         message = "an upper bound: the trace of Tanwani's H(12), which E[P_i] stays below"
     if target.of_errors:
         message += _explain_errors(scenario)
-    value = float(traces.max() if target.of_worst else traces.mean())
     if target.quantity == "within_central":
-        value /= central_trace(scenario)
+        traces = over_central(traces, central_traces(scenario))
+    value = float(traces.max() if target.of_worst else traces.mean())
     return math.sqrt(value) if target.of_errors else value, message
 
 
@@ -173,17 +183,19 @@ def quantity_by_simulation(
     metrics: RunMetrics,
     target: Target,
     level: float,
-    central: float | None,
+    central: FloatArray | None,
     names: Sequence[str] = (),
 ) -> QuantityInterval:
     """Return the quantity over runs with Student's interval, of the worst node for all nodes
-    (Bonferroni), which misses it with probability ``level``; ``central`` is a trace of P to divide
-    by, ``names`` those of ``metrics.quantities``.
+    (Bonferroni), which misses it with probability ``level``; ``central`` (N,) are traces of P
+    to divide by, ``names`` those of ``metrics.quantities``.
     """
     if target.of_runs:
         values = metrics.quantities[:, [names.index(target.quantity)]]
     else:
         values = metrics.mean_square if target.of_errors else metrics.trace
+    if central is not None:
+        values = over_central(values, central)
     if (np.isnan(values) & ~(metrics.diverged > 0)).any():
         # Rounding hides the errors of some run: nothing can be decided.
         return QuantityInterval(math.nan, -math.inf, math.inf)
@@ -197,8 +209,6 @@ def quantity_by_simulation(
     width = float(scipy.special.stdtrit(runs - 1, 1.0 - level / (2.0 * count))) * error
     # The largest mean lies between the largest lower and the largest upper end of all columns.
     ends = np.array([mean.max(), (mean - width).max(), (mean + width).max()])
-    if central is not None:
-        ends /= central
     ends = np.sqrt(np.maximum(ends, 0.0)) if target.of_errors else ends
     # nan is inf - inf of diverged runs, whose errors count as infinite.
     return QuantityInterval(*map(float, np.where(np.isnan(ends), np.inf, ends)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 import netkf
 from netkf.cli.main import main
-from netkf.studies.metrics import central_trace
+from netkf.studies.metrics import central_traces
 from tests.algorithms.test_block_intersection import ROBOTS, load
 
 COMMANDS = {
@@ -76,6 +77,26 @@ def test_ratios_are_by_the_number_of_states_of_each_node(tmp_path: Path) -> None
     run = netkf.simulate(scenario)
     after = run.times > 0.0
     traces = [np.trace(run.P[after, k, :n, :n], axis1=1, axis2=2) for k, n in enumerate((2, 3, 2))]
-    np.testing.assert_allclose(central_trace(scenario), np.mean(traces), rtol=1e-9)
+    np.testing.assert_allclose(central_traces(scenario), np.mean(traces, axis=1), rtol=1e-9)
     ensemble = netkf.monte_carlo(scenario, runs=2)
     assert np.isfinite(ensemble.mean_nees[1:]).all()
+
+
+def test_nodes_are_held_to_the_central_filter_of_what_they_estimate(tmp_path: Path) -> None:
+    """The central filter itself is within 1 of it, whatever nodes estimate."""
+    scenario = load(ROBOTS, tmp_path, horizon=4.0, filter__kind="central")
+    assert np.ptp(central_traces(scenario)) > 0.1 * central_traces(scenario).max()
+    largest = math.sqrt(central_traces(scenario).max())
+    for by in (None, "simulation"):
+        sized = netkf.size(scenario, "seed", 1, 9, "within_central<=1.1", by, runs=32)
+        assert (sized.value, sized.probes[0].quantity) == (1, pytest.approx(1.0)), by
+    # That the worst node of the central filter misses a limit says that any exchange would.
+    sized = netkf.size(scenario, "seed", 1, 9, f"worst_rms<={0.99 * largest}", "simulation", 32)
+    assert sized.value is None
+    assert sized.central.endswith("no exchange of messages reaches the limit, better readings may")
+
+
+def test_a_target_beside_a_central_filter_without_law_is_refused_at_its_key() -> None:
+    robots = netkf.load("scenarios/blocks/cooperative_localisation.toml")
+    with pytest.raises(netkf.TheoryError, match=r"--target: .* not linear; ask for worst_rms"):
+        netkf.size(robots, "seed", 1, 9, "within_central<=2")

@@ -24,7 +24,7 @@ from netkf.studies.metrics import (
     all_nodes,
     block_metrics,
     bound_traces,
-    central_trace,
+    central_traces,
     expected_errors_known,
     expected_metrics,
     join_metrics,
@@ -300,7 +300,7 @@ def test_the_centralised_filter_follows_changes_of_the_plant():
 
     before = scipy.integrate.solve_ivp(slope, (0.0, 1.0), [1.0], rtol=1e-9).y[0, -1]
     after = scipy.integrate.solve_ivp(slope, (1.0, 4.0), [before], rtol=1e-9, t_eval=[2, 3, 4])
-    assert central_trace(scenario) == pytest.approx(np.mean([before, *after.y[0]]), rel=1e-5)
+    assert central_traces(scenario) == pytest.approx(np.mean([before, *after.y[0]]), rel=1e-5)
 
 
 def test_json_of_a_sweep_is_one_document(tmp_path, capsys, monkeypatch):
@@ -338,7 +338,7 @@ def test_references_are_the_textbook_recursion(build):
             matching = {"kind": "matching", "protocol": "maximal"}
             changes["network"] = {**SCALAR["network"], "activation": matching}
         scenario = build(**changes)
-        assert central_trace(scenario) == pytest.approx(scalar_traces(12, predicts, R=0.25))
+        assert central_traces(scenario) == pytest.approx(scalar_traces(12, predicts, R=0.25))
         if kind == "gossip":
             with pytest.raises(TheoryError):
                 bound_traces(scenario)

@@ -228,7 +228,7 @@ def test_check_follows_the_changes(aware):
 
 
 def test_a_size_is_found_where_the_plant_changes():
-    from netkf.studies.metrics import bound_traces, central_trace
+    from netkf.studies.metrics import bound_traces, central_traces
 
     s = slots("local")
     run = netkf.simulate(s)
@@ -236,7 +236,7 @@ def test_a_size_is_found_where_the_plant_changes():
     np.testing.assert_allclose(bound_traces(s), traces, rtol=1e-9)
     central = netkf.simulate(slots("central"))
     mean = np.trace(central.P[1:, 0], axis1=1, axis2=2).mean()
-    np.testing.assert_allclose(central_trace(s), mean, rtol=1e-9)
+    np.testing.assert_allclose(central_traces(s), mean, rtol=1e-9)
 
 
 def test_pieces_are_scenarios_of_their_own():
