@@ -52,6 +52,8 @@ class Innovations(NamedTuple):
     deviations : M arrays (p,), square roots of the diagonal of S
     log_density : (M,) log density of v, normal with covariance S
     increments : number of readings that are increments
+    components : M arrays (p,), which of all values that sensors of the node give they are, from 0;
+                 None if they are counted in each reading
     """
 
     times: FloatArray
@@ -63,6 +65,7 @@ class Innovations(NamedTuple):
     deviations: list[FloatArray]
     log_density: FloatArray
     increments: int = 0
+    components: list[np.ndarray] | None = None
 
 
 class Recorded(NamedTuple):

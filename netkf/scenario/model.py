@@ -404,10 +404,12 @@ class ScenarioModel(Component):
             is_plain = len(of_row) == 1 and bool((np.abs(row[row != 0.0]) == 1.0).all())
             yield of_row.pop() if is_plain else ""
 
-    def label_of_value(self, node: int, number: int, sizes: np.ndarray) -> str:
-        """Return the label of value ``number`` of readings of ``sizes`` (M,), or empty."""
+    def label_of_value(self, node: int, number: int, sizes: np.ndarray | None) -> str:
+        """Return the label of value ``number`` of readings of ``sizes`` (M,), or of all that the
+        node reads; empty if it is unknown.
+        """
         labels = self.labels_of_readings(node)
-        is_whole = bool((sizes == len(labels)).all())
+        is_whole = sizes is None or bool((sizes == len(labels)).all())
         return labels[number] if is_whole else labels[0] if len(set(labels)) == 1 else ""
 
     def what_is_read(self, node: int) -> str:

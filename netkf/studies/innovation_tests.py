@@ -195,7 +195,8 @@ def innovations(run: Run | Scenario, confidence: float = 0.99) -> InnovationTest
 def recorded_innovations(run: Run) -> Innovations:
     """Return the innovations of a run; raises NetkfError without any."""
     scenario = run.scenario
-    if type(scenario.node_filter) is Central and scenario.is_linear:
+    exact = scenario.filter.gate is None and not scenario.network.clocks
+    if type(scenario.node_filter) is Central and exact:
         try:
             return CentralModel(scenario, run.seed, run.replica).as_innovations()
         except ScenarioError:
@@ -244,9 +245,10 @@ def _judge_node(
     nis, rows, is_white = recorded.nis[chosen], recorded.rows[chosen], law.kind == "white"
     freedom, mean = float(rows.sum()), float(nis.sum() / rows.sum())
     whitened = [recorded.whitened[i] for i in chosen]
-    columns = [
-        np.array([one[c] for one in whitened if len(one) > c]) for c in range(int(rows.max()))
-    ]
+    given = recorded.components
+    places = [np.arange(p) for p in rows] if given is None else [given[i] for i in chosen]
+    flat, of = np.concatenate(whitened), np.concatenate(places)
+    columns = [flat[of == c] for c in np.unique(of)]
     # Correlated readings count as fewer independent ones.
     inflation = 1.0 if is_white else _inflation(columns)
     counted = freedom / inflation
@@ -254,9 +256,9 @@ def _judge_node(
     if counted > 0.0:
         low, high = (float(end) for end in chi_square_interval(counted, 1.0 - level))
         detectable = high / (2.0 * float(gammaincinv(0.5 * counted, 1.0 - POWER)) / counted)
-    bias, reach, found, component = _bias(recorded, chosen, inflation, level)
-    label = scenario.label_of_value(node, component, rows)
-    lags = min(LAGS, len(chosen) // 5)
+    bias, reach, found, component = _bias(recorded, chosen, of, inflation, level)
+    label = scenario.label_of_value(node, component, rows if given is None else None)
+    lags = min(LAGS, max(map(len, columns)) // 5)
     columns = [column for column in columns if len(column) >= MIN_READINGS]
     statistic = p = correlation = math.nan
     if columns:
@@ -312,22 +314,23 @@ def _inflation(columns: list[FloatArray]) -> float:
 
 
 def _bias(
-    recorded: Innovations, chosen: np.ndarray, inflation: float, level: float
+    recorded: Innovations, chosen: np.ndarray, places: np.ndarray, inflation: float, level: float
 ) -> tuple[float, float, float, int]:
     """Return the largest bias, how far from 0 it may be, what POWER finds, and the component."""
-    best = math.nan, math.inf, math.nan, 0
-    count = int(recorded.rows[chosen].max())
-    for c in range(count):
-        kept = [i for i in chosen if recorded.rows[i] > c]
-        v = np.array([recorded.values[i][c] for i in kept])
-        weights = np.array([recorded.deviations[i][c] for i in kept]) ** -2.0
+    best = math.nan, math.inf, math.nan, -1
+    values = np.concatenate([recorded.values[i] for i in chosen])
+    deviations = np.concatenate([recorded.deviations[i] for i in chosen])
+    components = np.unique(places).tolist()
+    for c in components:
+        v, weights = values[places == c], deviations[places == c] ** -2.0
         bias, error = float(weights @ v / weights.sum()), math.sqrt(inflation / weights.sum())
-        quantile = -float(ndtri(level / count / 2.0))
+        tail = level / len(components) / 2.0
+        quantile = -float(ndtri(tail))
         if inflation > 1.0:  # estimated from as many independent values
             freedom = max(len(v) / inflation - 1.0, 1.0)
-            quantile = -float(stdtrit(freedom, level / count / 2.0))
+            quantile = -float(stdtrit(freedom, tail))
         reach = quantile * error
-        if c == 0 or abs(bias) / reach > abs(best[0]) / best[1]:
+        if best[3] < 0 or abs(bias) / reach > abs(best[0]) / best[1]:
             best = bias, reach, reach + float(ndtri(POWER)) * error, c
     return best
 

@@ -31,6 +31,7 @@ from netkf.linalg.small import add_matmul, matmul
 from netkf.plants.transitions import Transitions
 from netkf.runs.readings import Readings, collect_readings
 from netkf.runs.simulate import require_scenario
+from netkf.scenario.model import PlacedSensor
 from netkf.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -101,7 +102,8 @@ class CentralModel:
     """The central Kalman filter of a scenario over the readings of a ``replica``, as a function of
     the variances of its noises.
 
-    times, nodes : (M,) seconds and ids of scalar readings
+    times, nodes, components : (M,) seconds and ids of scalar readings, and which values of all that
+                               the node reads they are
     """
 
     def __init__(self, scenario: Scenario, seed: int, replica: int) -> None:
@@ -122,6 +124,11 @@ class CentralModel:
         """Lay out scalar readings: those of a noise that is not diagonal are decorrelated."""
         index = {(v.entry, row): k for k, v in enumerate(self.variances) for row in v.rows}
         H, of, owners = [], [], []
+        first = {
+            (node, one.ordinal): sum(_rows_of(scenario, before) for before in placed[:k])
+            for node, placed in scenario.placed_sensors.items()
+            for k, one in enumerate(placed)
+        }
         y, scales = list[float](), list[float]()
         for one in got.readings:
             diagonal = np.diag(one.R)
@@ -134,13 +141,15 @@ class CentralModel:
             y += z.tolist()
             H += list(J)
             of += [index.get((entry, row), -1) for row in one.rows.tolist()]
-            owners += [(one.number, got.times[one.number], one.node)] * len(z)
-        numbers = np.array([number for number, _, _ in owners])
+            at = one.number, got.times[one.number], one.node
+            owners += [(*at, first[one.node, one.placed.ordinal] + int(row)) for row in one.rows]
+        numbers = np.array([number for number, *_ in owners])
         self.H, self.y = np.array(H), np.array(y)
         # The first row of each instant, and their number.
         self._first = np.searchsorted(numbers, np.arange(len(got.times) + 1))
         self._of, self._scales = np.array(of), np.array(scales)
-        _, self.times, self.nodes = map(np.array, zip(*owners, strict=True))
+        columns = map(np.array, zip(*owners, strict=True))
+        _, self.times, self.nodes, self.components = columns
 
     def _lay_laws(self, scenario: Scenario, times: FloatArray) -> None:
         parts = [v.Q for v in self.variances if v.Q is not None]
@@ -192,8 +201,15 @@ class CentralModel:
         rows = np.ones(len(v), dtype=np.int64)
         parts = v / np.sqrt(S), v * self._scales, np.sqrt(S) * self._scales
         whitened, values, deviations = (list(part[:, None]) for part in parts)
-        nis, density = v * v / S, self._densities(v, S)
-        return Innovations(self.times, self.nodes, rows, nis, whitened, values, deviations, density)
+        return Innovations(
+            self.times, self.nodes, rows, v * v / S, whitened, values, deviations,
+            self._densities(v, S), components=list(self.components[:, None]),
+        )  # fmt: skip
+
+
+def _rows_of(scenario: Scenario, placed: PlacedSensor) -> int:
+    """Return the number of values that a linear sensor reads."""
+    return len(scenario.sensors[placed.entry].matrix_of(scenario.plant.n))
 
 
 def _require_central(scenario: Scenario) -> None:

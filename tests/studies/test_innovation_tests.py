@@ -301,6 +301,24 @@ def test_what_is_biased_has_its_name_and_unit(tmp_path):
     assert " of " not in format_innovations(alone).splitlines()[0]
 
 
+def test_values_of_the_central_filter_are_told_apart(tmp_path):
+    """It takes them one by one: biases of two values, or of two sensors at times of their own, do
+    not cancel. A sensor that is bad is still that of its node.
+    """
+    clock = WALK["sensors"][0]["sampling"]
+    fault = {"kind": "biased", "size": [2.0, -2.0]}
+    pair = {"nodes": [1], "H": np.eye(2).tolist(), "R": np.eye(2).tolist(), "sampling": clock}
+    first, second = ({**pair, "H": [row], "R": [[1.0]]} for row in np.eye(2).tolist())
+    faults = ({"fault": {"kind": "biased", "size": [size]}} for size in (2.0, -2.0))
+    apart = [{**one, **bad} for one, bad in zip((first, second), faults, strict=True)]
+    for sensors in ([{**pair, "fault": fault}], apart):
+        changed = {"horizon": 60.0, "sensors": sensors, "filter": {"kind": "central"}}
+        (row,) = netkf.innovations(from_table({**NAMED, **changed}, tmp_path)).rows
+        assert (row.node, row.label in ("height (m)", "speed (m/s)")) == (1, True)
+        assert abs(row.bias) > 1.0
+        assert f"biased in {row.label}" in row.verdict
+
+
 def test_consistency_names_the_states(tmp_path):
     scenario = from_table({**NAMED, "sensors": NAMED["sensors"][:1]}, tmp_path)
     found = netkf.consistency(scenario, 10, engine="simpy", workers=1)
