@@ -46,6 +46,7 @@ def stacked_sensors(
                 if one is not sensor:
                     object.__setattr__(one, STACKED, sensors)
                     object.__setattr__(one, "held_out", sensor.held_out)
+                    object.__setattr__(one, "fault", sensor.fault)
                 stacked.append(one)
                 entries.append(k)
     return tuple(stacked), tuple(entries)
@@ -131,8 +132,7 @@ def estimated_blocks(
 
 def _of_blocks(sensor: Any, layout: Layout, topology: Topology) -> Iterator[Any]:
     if isinstance(sensor, RELATIVE):
-        for one in sensor.lowered(layout, list(_pairs(sensor, layout, topology))):
-            yield one if sensor.fault is None else dataclasses.replace(one, fault=sensor.fault)
+        yield from sensor.lowered(layout, list(_pairs(sensor, layout, topology)))
         return
     name = _name_of(sensor, layout)
     if name is None:
@@ -168,6 +168,7 @@ def _at_place(sensor: Any, place: Place, nodes: tuple[int, ...], layout: Layout)
         if largest >= place.n:
             rule = f"must be components of block {place.name!r}, which has {place.n}"
             raise ScenarioError("states", rule, list(sensor.states), "they count from 0")
+        sensor.check_state(place.n)
         states = tuple(place.first + s for s in sensor.states)
         heading = None if sensor.heading is None else place.first + sensor.heading
         positions = sensor.positions

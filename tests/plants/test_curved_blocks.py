@@ -233,6 +233,22 @@ def test_mistakes_in_blocks_are_refused_in_one_line(scenario, key, value, words)
 
 
 @pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("positions", [[0.0, 1.0]], "positions: must be 2 rows of 2, one for each of nodes"),
+        ("heading", 2, "heading: must be a component of a state of 3, and means nothing"),
+        ("R", [[1.0, 0.0], [0.0, 1.0]], "R: must be 1 x 1"),
+        ("states", [0, 3], "states: must be components of block 'pose', which has 3"),
+    ],
+)
+def test_mistakes_in_sensors_of_blocks_are_those_of_the_file(scenario, key, value, words):
+    places = {"kind": "range", "of": "pose", "nodes": [1, 2], "R": [[1.0]], key: value}
+    with pytest.raises(netkf.ScenarioError) as caught:
+        scenario.replace({"sensors": [{"positions": [[0.0, 1.0], [2.0, 3.0]]} | places]})
+    assert str(caught.value).startswith(f"sensors[0].{words}")
+
+
+@pytest.mark.parametrize(
     ("key", "value"),
     [
         ("schedule", [{"from": 1.0, "F": [[0.5]]}]),

@@ -108,6 +108,61 @@ def test_estimates_are_those_of_the_readings_that_are_given(scenario_of, kind, s
     np.testing.assert_allclose(run.xhat[:, 1], expected, rtol=1e-9, atol=1e-9)
 
 
+CURVED = """
+format = 1
+name = "bad-ranges"
+horizon = 8.0
+probe = 0.5
+[[plants]]
+name = "pose"
+kind = "nonlinear"
+f = "unicycle"
+nodes = [0, 1]
+period = 0.5
+Q = [[0.01, 0.0, 0.0], [0.0, 0.01, 0.0], [0.0, 0.0, 0.001]]
+mean = [1.0, 2.0, 0.1]
+cov = [[0.5, 0.0, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, 0.01]]
+[plants.input]
+kind = "sine"
+amplitude = [1.0, 0.3]
+frequency = [0.1, 0.2]
+[[sensors]]
+kind = "range-bearing"
+of = "pose"
+nodes = [0, 1]
+positions = [[9.0, 1.0], [0.0, 7.0]]
+R = [[0.1, 0.0], [0.0, 0.01]]
+{fault}
+[[sensors]]
+kind = "relative-range"
+of = "pose"
+R = [[0.2]]
+fault = {{ kind = "outliers", probability = 0.3, sigma = 2.0 }}
+[network]
+graph = {{ kind = "path", nodes = 2 }}
+activation = {{ kind = "broadcast" }}
+channel = {{ loss = {{ kind = "bernoulli", delivery = 0.8 }} }}
+lives = [{{ kind = "duty", period = 3.0, up = 2.0, nodes = [1] }}]
+[filter]
+kind = "{filter}"
+estimates = "{estimates}"
+"""
+
+
+@pytest.mark.parametrize("kind", FAULTS)
+@pytest.mark.parametrize("filter", ["block-intersection own", "diffusion all"])
+def test_curved_and_relative_readings_are_given_alike_by_both_engines(tmp_path, kind, filter):
+    algorithm, estimates = filter.split()
+    text = CURVED.format(fault=FAULTS[kind], filter=algorithm, estimates=estimates)
+    (tmp_path / "ranges.toml").write_text(text)
+    scenario = netkf.load(tmp_path / "ranges.toml")
+    simpy, compiled = (netkf.simulate(scenario, engine=name) for name in ("simpy", "compiled"))
+    assert simpy.fingerprint == compiled.fingerprint
+    np.testing.assert_allclose(compiled.xhat, simpy.xhat, rtol=1e-9, atol=1e-9)
+    healthy = netkf.simulate(scenario.replace({"sensors.0.fault": None}), engine="compiled")
+    assert abs(compiled.xhat - healthy.xhat).max() > 1e-3
+
+
 OWN = """
 from dataclasses import dataclass
 import numpy as np

@@ -35,8 +35,6 @@ def reads_in_python(sensor: Sensor, slotted: bool) -> bool:
     """
     if isinstance(sensor, NonlinearSensor):
         name = "slot_path" if slotted else "samples"
-        if slotted and sensor.fault is not None:
-            return False
         return getattr(type(sensor), name) is getattr(NonlinearSensor, name)
     return sensor.linear and (slotted or getattr(sensor, "sampling", None) is not None)
 

@@ -62,6 +62,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import LANES, MANY, aligned, blocks_of, by_run, in_lanes, unset
 from netkf.linalg.portable import cholesky, solve_lower
 from netkf.network.deliveries import Deliveries
+from netkf.plants.faults import Course, Fault
 from netkf.plants.maps import NonlinearPlant
 from netkf.plants.slot_paths import (
     MapPaths,
@@ -216,6 +217,14 @@ class SlotRuns:
             (s, [scenario.slot_path(r, s.node, s.placed_sensor) for r in streams.per_replica])
             for s in setup.own_sensors
         ]
+        # What is not linear is read by kernels: what a bad sensor gives instead, for each run.
+        faults = [(s, scenario.fault_of(s.node, s.placed_sensor)) for s in setup.nonlinear_sensors]
+        self._bad: list[tuple[AssignedSensor, Fault, list[Course]]] = []
+        for s, fault in faults:
+            if fault is not None:
+                entity = "fault", s.node, s.placed_sensor.ordinal
+                given = [fault.begin(one.generator(*entity)) for one in streams.per_replica]
+                self._bad.append((s, fault, given))
 
     def _begin_messages(self) -> None:
         setup, streams = self.setup, self._streams
@@ -610,11 +619,22 @@ class SlotRuns:
             flat_y = y.reshape(-1, *y.shape[3:])
             add_values(self._drawn, x, flat_y, setup.places, setup.drawn.drawn)
             setup.nonlinear.raise_error()
+        self._give_bad_readings(times, y)
         if (self._recorded or self._own) and times.sensed.any():
             self._read_in_python(times, x, y, H)
         if self._scenario.network.lives:
             self._silence(y, H)
         return y, H
+
+    def _give_bad_readings(self, times: SlotTimes, y: FloatArray) -> None:
+        """Write what sensors that are bad, and not linear, give in place of their readings."""
+        sensed = np.flatnonzero(times.sensed).tolist() if self._bad else []
+        for k, time in [(k, self._scenario.slot_plant.slot_time(self._slot + k)) for k in sensed]:
+            for s, fault, given in self._bad:
+                readings = y[:, k, s.estimator, s.row : s.row + s.rows]
+                for run, give in enumerate(given if fault.holds(time) else ()):
+                    b, lane = divmod(run, LANES)
+                    readings[b, :, lane] = give(time, readings[b, :, lane].copy())
 
     def _silence(self, y: FloatArray, H: FloatArray) -> None:
         """Take away the readings of nodes that are down."""
