@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.random import Generator
 
 from netkf.core.clock import Clock, Entity
-from netkf.core.csv_files import read_columns, read_header
+from netkf.core.csv_files import Columns, read_columns, read_header
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     Rule,
@@ -357,10 +357,12 @@ class RecordedClock(LinkClock):
 
     _reads = "_instants"
 
+    @property
+    def _ends(self) -> tuple[str, ...]:
+        return ("node",) if self.at == "nodes" else ("node", "peer")
+
     @cached_property
-    def _rows(self) -> tuple[list[tuple[Entity, float]], dict[Entity, int]]:
-        """Entity and time (s) of each row, and the first line of each node or pair."""
-        columns = ("node",) if self.at == "nodes" else ("node", "peer")
+    def _table(self) -> Columns:
         if self.at == "nodes" and "peer" in read_header(self.path):
             raise ScenarioError(
                 "path",
@@ -368,16 +370,10 @@ class RecordedClock(LinkClock):
                 None,
                 'set at = "directions", or rename the column',
             )
-        table = read_columns(self.path, ("t", *columns))
+        table = read_columns(self.path, ("t", *self._ends))
         early = np.flatnonzero(table["t"] <= 0.0)
         table.refuse_early(early, "t must be above 0, nothing is sent at time 0")
-        entities: list[Entity] = list(zip(*map(table.integers, columns), strict=True))
-        first_line: dict[Entity, int] = {}
-        for entity, line in zip(entities, table.lines.tolist(), strict=True):
-            first_line.setdefault(entity, line)
-        if self.at == "links":
-            entities = [(min(entity), max(entity)) for entity in entities]
-        return list(zip(entities, table["t"].tolist(), strict=True)), first_line
+        return table
 
     @cached_property
     def _instants(self) -> dict[Entity, FloatArray]:
@@ -392,12 +388,15 @@ class RecordedClock(LinkClock):
     @property
     def rows(self) -> FloatArray:
         """The times (K,) of all rows in seconds, in the order of the table."""
-        return np.array([t for _, t in self.row_keys])
+        return self._table["t"]
 
-    @property
+    @cached_property
     def row_keys(self) -> list[tuple[Entity, float]]:
         """The entity and the time (s) of each row, in order; equal ones are one tick."""
-        return self._rows[0]
+        entities: Iterable[Entity] = zip(*map(self._table.integers, self._ends), strict=True)
+        if self.at == "links":
+            entities = ((min(entity), max(entity)) for entity in entities)
+        return list(zip(entities, self.rows.tolist(), strict=True))
 
     def ticks(
         self, entity: Entity, origin: float, index: int, now: float, random: Generator, count: int
@@ -408,6 +407,6 @@ class RecordedClock(LinkClock):
     def check(self, topology: Topology) -> None:
         """Raise ScenarioError unless the graph has every entity that the table lists."""
         if self.at == "nodes":
-            demand_nodes(self.path, {node: k for (node,), k in self._rows[1].items()}, topology)
+            demand_nodes(self._table, topology.index)
         else:
-            demand_links(self.path, self._rows[1], topology)
+            demand_links(self._table, topology, "node", "peer")

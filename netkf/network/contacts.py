@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.random import Generator
 
 from netkf.core.clock import Entity
-from netkf.core.csv_files import read_columns
+from netkf.core.csv_files import Columns, read_columns
 from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.fields import SourceFile, field, instance_of, source_file
 from netkf.linalg.arrays import FloatArray
@@ -24,9 +24,6 @@ INNER = (Poisson, Renewal, Periodic)
 """The clocks that links may have while they are in contact."""
 NUMBER_TOLERANCE = 1e-6
 """Share of a period by which rounding may move a tick, when its number is found from its time."""
-
-RowKey = tuple[Entity, float, float]
-"""The link or direction of a row of contacts, and its beginning and end in seconds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +55,7 @@ class Contacts(LinkClock):
         _ = self._intervals  # a mistake in the file is found on construction
 
     @cached_property
-    def _rows(self) -> tuple[list[RowKey], dict[Entity, int]]:
-        """The key of each row, and the line number of the first row of each pair as listed."""
+    def _table(self) -> Columns:
         table = read_columns(self.path, ("from", "until", "node", "peer"))
         wrong = np.flatnonzero(table["until"] <= table["from"])
         if wrong.size:
@@ -67,19 +63,16 @@ class Contacts(LinkClock):
             rule = f"{table.where(row)}: until must be after from"
             interval = [float(table["from"][row]), float(table["until"][row])]
             raise ScenarioError("path", rule, interval, "correct the row")
-        pairs: list[Entity] = list(zip(table.integers("node"), table.integers("peer"), strict=True))
-        first_line: dict[Entity, int] = {}
-        for pair, line in zip(pairs, table.lines.tolist(), strict=True):
-            first_line.setdefault(pair, line)
-        if self.at == "links":
-            pairs = [(min(pair), max(pair)) for pair in pairs]
-        keys = zip(pairs, table["from"].tolist(), table["until"].tolist(), strict=True)
-        return list(keys), first_line
+        return table
 
-    @property
-    def row_keys(self) -> list[RowKey]:
-        """The link, beginning and end of each row, in the order of the table."""
-        return self._rows[0]
+    @cached_property
+    def row_keys(self) -> list[tuple[Entity, float, float]]:
+        """The link or direction, beginning and end (s) of each row, in the order of the table."""
+        table = self._table
+        pairs: Iterable[Entity] = zip(*map(table.integers, ("node", "peer")), strict=True)
+        if self.at == "links":
+            pairs = ((min(pair), max(pair)) for pair in pairs)
+        return list(zip(pairs, table["from"].tolist(), table["until"].tolist(), strict=True))
 
     @cached_property
     def _intervals(self) -> dict[Entity, tuple[FloatArray, FloatArray]]:
@@ -167,7 +160,7 @@ class Contacts(LinkClock):
 
     def check(self, topology: Topology) -> None:
         """Raise ScenarioError unless every pair of the table is a link, and the clock fits."""
-        demand_links(self.path, self._rows[1], topology)
+        demand_links(self._table, topology, "node", "peer")
         with errors_under("clock"):
             self.clock.check(topology)
 

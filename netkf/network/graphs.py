@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from netkf.core.csv_files import read_columns, read_header
+from netkf.core.csv_files import Columns, read_columns, read_header
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     Component,
@@ -193,23 +193,24 @@ def demand_in_graph(nodes: Sequence[int], topology: Topology) -> None:
             raise ScenarioError(f"nodes[{k}]", "must be a node of the graph", node, "remove it")
 
 
-def demand_links(source: SourceFile, lines: Mapping[Link, int], topology: Topology) -> None:
-    """Raise ScenarioError if a file has a pair that is no link, at one of its ``lines``."""
-    links = set(topology.links)
-    if not topology.directed:
-        links |= {(j, i) for i, j in links}
-    unknown = min(lines.keys() - links, key=lines.__getitem__, default=None)
-    if unknown is not None:
-        rule = f"{source.name} line {lines[unknown]}: every pair must be a link of the graph"
-        raise ScenarioError("path", rule, list(unknown), "correct the row or add the link")
+def demand_links(table: Columns, topology: Topology, sender: str, receiver: str) -> None:
+    """Raise ScenarioError if a table has a pair, in these two columns, that is no link."""
+    links = np.array(topology.directions).reshape(-1, 2) @ [1.0, 1.0j]
+    wrong = np.flatnonzero(~np.isin(table[sender] + 1.0j * table[receiver], links))
+    if wrong.size:
+        row = int(wrong[0])
+        rule = f"{table.where(row)}: every pair must be a link of the graph"
+        pair = [table.integers(name)[row] for name in (sender, receiver)]
+        raise ScenarioError("path", rule, pair, "correct the row or add the link")
 
 
-def demand_nodes(source: SourceFile, lines: Mapping[int, int], topology: Topology) -> None:
-    """Raise ScenarioError if a file has a node that is not there, at one of its ``lines``."""
-    unknown = min(lines.keys() - topology.index.keys(), key=lines.__getitem__, default=None)
-    if unknown is not None:
-        rule = f"{source.name} line {lines[unknown]} names a node that the graph does not have"
-        raise ScenarioError("path", rule, unknown, "correct the row or the graph")
+def demand_nodes(table: Columns, nodes: Iterable[int]) -> None:
+    """Raise ScenarioError if a table has a node that is none of the ``nodes`` (ids)."""
+    wrong = np.flatnonzero(~np.isin(table["node"], list(nodes)))
+    if wrong.size:
+        node = table.integers("node")[wrong[0]]
+        rule = f"{table.where(int(wrong[0]))} names a node that the graph does not have"
+        raise ScenarioError("path", rule, node, "correct the row or the graph")
 
 
 @dataclass(frozen=True, eq=False)

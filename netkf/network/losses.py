@@ -15,7 +15,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from netkf.core.csv_files import read_columns
+from netkf.core.csv_files import Columns, read_columns
 from netkf.core.errors import ScenarioError, quote
 from netkf.core.fields import (
     Component,
@@ -385,10 +385,10 @@ class GilbertElliott(Loss):
         return "sender" if self.shared else "link"
 
     @cached_property
-    def _table(self) -> tuple[dict[Link, GilbertElliott], dict[Link, int], list[Link]]:
-        """The chain of each directed link with a row, its line, and the link of each row."""
+    def _table(self) -> tuple[dict[Link, GilbertElliott], Columns | None, list[Link]]:
+        """The chain of each directed link with a row, the table, and the link of each row."""
         if self.path is None:
-            return {}, {}, []
+            return {}, None, []
         table = read_columns(self.path, ("sender", "receiver"), _CHAIN)
         links = list(zip(table.integers("sender"), table.integers("receiver"), strict=True))
         columns = [name for name in _CHAIN if name in table]
@@ -404,14 +404,14 @@ class GilbertElliott(Loss):
             except ScenarioError as error:
                 rule = f"{table.where(row)}: {error.key} {error.rule}"
                 raise ScenarioError("path", rule, error.value, error.remedy) from None
-        lines = {link: int(table.lines[row]) for link, row in first_row.items()}
         for first, second in itertools.pairwise(sorted(chains) if self.shared else ()):
             steps = chains[first].transitions, chains[second].transitions
             if first[0] == second[0] and steps[0] != steps[1]:
                 rule = "must give all links of a sender the same transitions, if they are shared"
-                got = f"{list(first)} in line {lines[first]} and {list(second)} in line"
-                raise ScenarioError("path", rule, f"{got} {lines[second]}", "correct the rows")
-        return chains, lines, links
+                lines = [table.lines[first_row[link]] for link in (first, second)]
+                got = f"{list(first)} in line {lines[0]} and {list(second)} in line {lines[1]}"
+                raise ScenarioError("path", rule, got, "correct the rows")
+        return chains, table, links
 
     def use(self, end: float) -> RowUse:
         """Return the use of the rows of the table by a run to ``end`` (s)."""
@@ -426,14 +426,14 @@ class GilbertElliott(Loss):
         """Raise ScenarioError unless every row of the table is of a link, and every link has a
         chain.
         """
-        if self.path is None:
+        chains, table, _ = self._table
+        if table is None:
             return
-        chains, lines, _ = self._table
-        demand_links(self.path, lines, topology)
+        demand_links(table, topology, "sender", "receiver")
         if all(getattr(self, name) is None for name in _CHAIN):
             for link in topology.directions:
                 if link not in chains:
-                    rule = f"{self.path.name} must have a row of each direction"
+                    rule = f"{table.source.name} must have a row of each direction"
                     remedy = "add the row, or give mean_loss and mean_burst for all others"
                     raise ScenarioError("path", rule, f"none of {list(link)}", remedy)
 

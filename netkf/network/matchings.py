@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from netkf.core.contracts import is_netkf_class
-from netkf.core.csv_files import read_columns, read_header
+from netkf.core.csv_files import Columns, read_columns, read_header
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     Component,
@@ -266,34 +266,30 @@ class RecordedSlots(SlotActivation):
         return "phase" not in read_header(self.path)
 
     @cached_property
-    def _rows(self) -> tuple[list[RowKey], list[int]]:
-        """The key and the line number of each row."""
-        names: tuple[str, ...] = ("slot", "phase", "step", "node", "peer")
-        matching = self.matching
-        if matching:
-            names = ("slot", "node", "peer")
-        table = read_columns(self.path, names)
-        columns = {name: table.integers(name) for name in names}
-        zeros = [0] * len(table.lines)
-        phases, steps = columns.get("phase", zeros), columns.get("step", zeros)
-        links: Iterable[Link] = zip(columns["node"], columns["peer"], strict=True)
-        if matching:
-            # A pair has no direction, and may be listed from either end.
-            links = ((min(link), max(link)) for link in links)
-        keys = list(zip(columns["slot"], phases, steps, links, strict=True))
-        return keys, table.lines.tolist()
+    def _table(self) -> Columns:
+        exchange = () if self.matching else ("phase", "step")
+        return read_columns(self.path, ("slot", *exchange, "node", "peer"))
 
-    @property
+    @cached_property
     def row_keys(self) -> list[RowKey]:
         """The key of each row, in the order of the table; equal ones are one link that is up."""
-        return self._rows[0]
+        table = self._table
+        columns = {name: table.integers(name) for name in table}
+        zeros = [0] * len(table.lines)
+        phases, steps = (columns.get(name, zeros) for name in ("phase", "step"))
+        links: Iterable[Link] = zip(columns["node"], columns["peer"], strict=True)
+        if self.matching:
+            # A pair has no direction, and may be listed from either end.
+            links = ((min(link), max(link)) for link in links)
+        return list(zip(columns["slot"], phases, steps, links, strict=True))
 
     @cached_property
     def _pairs(self) -> dict[tuple[int, int, int], list[Link]]:
         """Pairs of node ids by (slot, phase, step), in the order of the table."""
         pairs: dict[tuple[int, int, int], dict[Link, int]] = {}
         matching = self.matching
-        for (slot, phase, step, link), line in zip(*self._rows, strict=True):
+        lines = self._table.lines.tolist()
+        for (slot, phase, step, link), line in zip(self.row_keys, lines, strict=True):
             listed = pairs.setdefault((slot, phase, step), {})
             if matching and link not in listed:
                 self._demand_free(slot, link, line, listed)
@@ -321,10 +317,7 @@ class RecordedSlots(SlotActivation):
 
     def check(self, topology: Topology) -> None:
         """Raise ScenarioError unless every recorded pair is a link."""
-        first_line: dict[Link, int] = {}
-        for (*_, link), line in zip(*self._rows, strict=True):
-            first_line.setdefault(link, line)
-        demand_links(self.path, first_line, topology)
+        demand_links(self._table, topology, "node", "peer")
 
 
 def _checked(activation: Matching, given: Any, topology: Topology) -> list[Link]:

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from netkf.core.csv_files import read_columns
+from netkf.core.csv_files import Columns, read_columns
 from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.fields import Component, SourceFile, field, one_of, source_file
 from netkf.core.repeated_rows import RowUse, count_rows, first_rows
@@ -34,14 +34,18 @@ class MessageTable:
     """A value for each listed message of each directed link: ``values[link][number]``, with
     messages of a link (sender, receiver) numbered from 0.
 
-    ``row_keys`` has the (sender, receiver, number) of each row: rows may repeat a message and its
-    value. ``lines`` has the line number of the first row of each link.
+    ``row_keys`` has the (sender, receiver, number) of each row of ``columns``: rows may repeat a
+    message and its value.
     """
 
-    source: SourceFile
+    columns: Columns
     values: Mapping[Link, Mapping[int, float]]
     row_keys: Sequence[tuple[int, int, int]]
-    lines: Mapping[Link, int]
+
+    @property
+    def source(self) -> SourceFile:
+        """The file of the table."""
+        return self.columns.source
 
     @cached_property
     def _lengths(self) -> dict[Link, int]:
@@ -88,11 +92,9 @@ def read_messages(
             raise ScenarioError("path", f"{table.where(row)}: {rule}", printed, "correct the row")
     first = first_rows(table, keys, entries, rule, COUNTER_REMEDY)
     values: dict[Link, dict[int, float]] = {}
-    first_line: dict[Link, int] = {}
     for (sender, receiver, message), row in first.items():
         values.setdefault((sender, receiver), {})[message] = entries[row]
-        first_line.setdefault((sender, receiver), int(table.lines[row]))
-    return MessageTable(source, values, keys, first_line)
+    return MessageTable(table, values, keys)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +110,7 @@ class _Recorded(Component):
 
     def check(self, topology: Topology) -> None:
         """Raise ScenarioError unless every recorded pair is a link."""
-        demand_links(self.path, self.table.lines, topology)
+        demand_links(self.table.columns, topology, "sender", "receiver")
 
 
 @dataclass(frozen=True, eq=False)

@@ -61,11 +61,9 @@ class ScheduledLoss(Loss, OnGrid):
     @cached_property
     def _steps(
         self,
-    ) -> tuple[
-        dict[Link, tuple[FloatArray, FloatArray]], dict[Link, int], list[tuple[Link, float, float]]
-    ]:
-        """Times (K,) and probabilities (K,) by link, first line numbers, and link, beginning and
-        end of each row.
+    ) -> tuple[dict[Link, tuple[FloatArray, FloatArray]], Columns, list[tuple[Link, float, float]]]:
+        """Times (K,) and probabilities (K,) by link, the table, and link, beginning and end of each
+        row.
         """
         table = _read_deliveries(self.path, ("from", "until", "sender", "receiver"))
         begins, ends, values = (table[name].tolist() for name in ("from", "until", "delivery"))
@@ -90,8 +88,7 @@ class ScheduledLoss(Loss, OnGrid):
                 times += [begins[row], ends[row]]
                 probabilities += [values[row], self.otherwise]
             steps[link] = np.array(times), np.array(probabilities)
-        lines = {link: int(table.lines[numbers[0]]) for link, numbers in rows.items()}
-        return steps, lines, keys
+        return steps, table, keys
 
     @cached_property
     def _instants(self) -> dict[Link, FloatArray]:
@@ -124,7 +121,7 @@ class ScheduledLoss(Loss, OnGrid):
 
     def check(self, topology: Topology) -> None:
         """Raise ScenarioError unless every pair of the table is a link."""
-        demand_links(self.path, self._steps[1], topology)
+        demand_links(self._steps[1], topology, "sender", "receiver")
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,11 +151,9 @@ class Hopping(Component):
     @cached_property
     def _table(
         self,
-    ) -> tuple[
-        Mapping[tuple[int, Link | None], float], dict[Link, int], list[tuple[int, Link | None]]
-    ]:
-        """The deliveries by channel and directed link (None: all), lines of the links, and the
-        channel and link of each row.
+    ) -> tuple[Mapping[tuple[int, Link | None], float], Columns, list[tuple[int, Link | None]]]:
+        """The deliveries by channel and directed link (None: all), the table, and the channel and
+        link of each row.
         """
         table = _read_deliveries(self.path, ("channel",), ("sender", "receiver"))
         channels: list[int] = table.integers("channel")
@@ -171,11 +166,7 @@ class Hopping(Component):
             links = list(zip(table.integers("sender"), table.integers("receiver"), strict=True))
         keys, values = list(zip(channels, links, strict=True)), table["delivery"].tolist()
         rows = first_rows(table, keys, values, "a channel must have one delivery")
-        lines: dict[Link, int] = {}
-        for (_, link), row in rows.items():
-            if link is not None:
-                lines.setdefault(link, int(table.lines[row]))
-        return {key: values[row] for key, row in rows.items()}, lines, keys
+        return {key: values[row] for key, row in rows.items()}, table, keys
 
     def use(self, end: float) -> RowUse:
         """Return the use of the rows by a run to ``end`` (s): of channels in use."""
@@ -197,9 +188,11 @@ class Hopping(Component):
 
     def check(self, topology: Topology) -> None:
         """Raise ScenarioError unless every pair of the table is a link, and each link is there."""
-        deliveries, lines, _ = self._table
-        demand_links(self.path, lines, topology)
-        for channel, link in itertools.product(self.hopping, topology.directions if lines else ()):
+        deliveries, table, _ = self._table
+        if "sender" not in table:
+            return
+        demand_links(table, topology, "sender", "receiver")
+        for channel, link in itertools.product(self.hopping, topology.directions):
             if (channel, link) not in deliveries:
                 rule = f"{self.path.name} must have a row of each direction on each channel"
                 got = f"none of {list(link)} on {channel}"
