@@ -11,26 +11,23 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
 
 import numpy as np
 
 from netkf.core.fields import boolean, field, matrix, seconds
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import apply
-from netkf.linalg.vector_functions import VectorFunction
-from netkf.plants.dynamics import StackedDynamics, dynamics, functions_of
 from netkf.plants.inputs import SineInput
 from netkf.plants.linear import Blocks
-from netkf.plants.maps import check_dynamics
+from netkf.plants.maps import NonlinearStates
 from netkf.plants.sensors import cut, step_noise
-from netkf.plants.states import RecordedStates
+from netkf.plants.truth import WithoutFrames
 
 InputTables = tuple[FloatArray, FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
-class NonlinearDiffusion(RecordedStates):
+class NonlinearDiffusion(NonlinearStates):
     """``dx = f(x, u(t), t) dt + B dw``.
 
     f     "unicycle" (x, y, heading, with speed and turn rate as input), "coordinated-turn" (x, y,
@@ -44,9 +41,6 @@ class NonlinearDiffusion(RecordedStates):
     with ``unknown`` there are none but those that filters assume.
     """
 
-    linear: ClassVar[bool] = False
-
-    f: Any = field(dynamics)
     B: FloatArray = field(matrix)
     step: float = field(seconds)
     unknown: bool = field(boolean, default=False)  # type: ignore[misc]
@@ -57,32 +51,9 @@ class NonlinearDiffusion(RecordedStates):
         return len(self.B)
 
     @property
-    def m(self) -> int:
-        """Number of components of the input, 0 without one."""
-        return 0 if self.input is None else self.input.m
-
-    @property
     def Q(self) -> FloatArray:
         """The covariance B B' (n, n) of the noise over a second."""
         return np.asarray(self.B @ self.B.T)
-
-    @cached_property
-    def functions(self) -> tuple[VectorFunction, VectorFunction]:
-        """The rate of change f and its Jacobian."""
-        f, jacobian = functions_of(self.f, self.n, self.m, in_slots=False)
-        return f, jacobian
-
-    def functions_of(self, entries: np.ndarray) -> tuple[Any, np.ndarray]:
-        """Return f and its Jacobian of the blocks whose states are ``entries`` (n',), and the
-        numbers of their inputs (m',).
-        """
-        parts, inputs = self.f.chosen(entries)
-        stacked = StackedDynamics(parts)
-        return functions_of(stacked, len(entries), len(inputs), in_slots=False), inputs
-
-    def check_dynamics(self) -> None:
-        """Raise ScenarioError if f does not fit the state or the input, or fails at the mean."""
-        check_dynamics(self, self.functions)
 
     @cached_property
     def tables_of_input(self) -> InputTables:
@@ -138,12 +109,10 @@ class NonlinearDiffusion(RecordedStates):
         return np.zeros(0) if self.input is None else self.input.at(time)
 
 
-class CurvePath:
+class CurvePath(WithoutFrames):
     """The states of one run at some times, from x(0) = ``start`` (n,) on; see
     ``NonlinearDiffusion.curve``.
     """
-
-    frame_times = np.empty(0)
 
     def __init__(
         self,
@@ -215,7 +184,3 @@ class CurvePath:
         """Return local and absolute states (K, n), which are equal, at ``times`` (K,)."""
         x = np.array([self._states[t] for t in times.tolist()]).reshape(-1, self._plant.n)
         return x, x
-
-    def rebase(self, k: int) -> FloatArray:
-        """Raise IndexError: there are no frames, so that none begins."""
-        raise IndexError(k)

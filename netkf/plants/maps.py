@@ -17,10 +17,45 @@ from netkf.linalg.vector_functions import VectorFunction
 from netkf.plants.dynamics import MOTIONS, StackedDynamics, dynamics, functions_of
 from netkf.plants.linear import BLOCK, Blocks, SlotPlant
 from netkf.plants.states import RecordedStates
+from netkf.plants.truth import WithoutFrames
 
 
 @dataclass(frozen=True, eq=False)
-class NonlinearPlant(RecordedStates, SlotPlant):
+class NonlinearStates(RecordedStates):
+    """A plant whose ``f`` need not be linear: a map of one slot, or else a rate of change."""
+
+    linear: ClassVar[bool] = False
+    in_slots: ClassVar[bool] = False
+    """Whether f is a map of one slot."""
+
+    f: Any = field(dynamics)
+
+    @property
+    def m(self) -> int:
+        """Number of components of the input, 0 without one."""
+        return 0 if self.input is None else self.input.m
+
+    @cached_property
+    def functions(self) -> tuple[VectorFunction, VectorFunction]:
+        """F and its Jacobian."""
+        f, jacobian = functions_of(self.f, self.n, self.m, self.in_slots)
+        return f, jacobian
+
+    def functions_of(self, entries: np.ndarray) -> tuple[Any, np.ndarray]:
+        """Return f and its Jacobian of the blocks whose states are ``entries`` (n',), and the
+        numbers of their inputs (m',).
+        """
+        parts, inputs = self.f.chosen(entries)
+        stacked = StackedDynamics(parts)
+        return functions_of(stacked, len(entries), len(inputs), self.in_slots), inputs
+
+    def check_dynamics(self) -> None:
+        """Raise ScenarioError if f does not fit the state or the input, or fails at the mean."""
+        _check_dynamics(self, self.functions)
+
+
+@dataclass(frozen=True, eq=False)
+class NonlinearPlant(NonlinearStates, SlotPlant):
     """``x[k+1] = f(x[k], u[k], t_k) + w[k]``, cov(w) = Q; slot k is at time ``k * period`` seconds,
     u[k] is the ``input`` then.
 
@@ -34,9 +69,8 @@ class NonlinearPlant(RecordedStates, SlotPlant):
     with ``unknown`` there are none but those that filters assume.
     """
 
-    linear: ClassVar[bool] = False
+    in_slots: ClassVar[bool] = True
 
-    f: Any = field(dynamics)
     Q: FloatArray = field(covariance)
     period: float = field(seconds)
     unknown: bool = field(boolean, default=False)  # type: ignore[misc]
@@ -46,34 +80,11 @@ class NonlinearPlant(RecordedStates, SlotPlant):
         """Dimension of the state."""
         return len(self.Q)
 
-    @property
-    def m(self) -> int:
-        """Number of components of the input, 0 without one."""
-        return 0 if self.input is None else self.input.m
-
-    @cached_property
-    def functions(self) -> tuple[VectorFunction, VectorFunction]:
-        """The map f and its Jacobian."""
-        f, jacobian = functions_of(self.f, self.n, self.m, in_slots=True)
-        return f, jacobian
-
     def inputs(self, slots: int) -> FloatArray:
         """Return u (S, m) of the slots 0 to S - 1."""
         if self.input is None:
             return np.zeros((slots, 0))
         return np.array(self.input.values(self.time_grid.snap(self.period * np.arange(slots))))
-
-    def functions_of(self, entries: np.ndarray) -> tuple[Any, np.ndarray]:
-        """Return f and its Jacobian of the blocks whose states are ``entries`` (n',), and the
-        numbers of their inputs (m',).
-        """
-        parts, inputs = self.f.chosen(entries)
-        stacked = StackedDynamics(parts)
-        return functions_of(stacked, len(entries), len(inputs), in_slots=True), inputs
-
-    def check_dynamics(self) -> None:
-        """Raise ScenarioError if f does not fit the state or the input, or fails at the mean."""
-        check_dynamics(self, self.functions)
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> MapPath:
         """Return the true states of one run, drawn from ``random``; frames are of linear plants."""
@@ -81,7 +92,7 @@ class NonlinearPlant(RecordedStates, SlotPlant):
         return MapPath(self, start, random)
 
 
-def check_dynamics(plant: Any, functions: tuple[VectorFunction, VectorFunction]) -> None:
+def _check_dynamics(plant: Any, functions: tuple[VectorFunction, VectorFunction]) -> None:
     """Raise ScenarioError if f does not fit the state or the input of a plant, or fails."""
     n, m = plant.n, plant.m
     # Blocks are checked one by one.
@@ -126,12 +137,10 @@ def _check_motion(plant: Any, motion: Any) -> None:
     raise ScenarioError("input", rule if m else f"is missing: it {rule}", got, remedy)
 
 
-class MapPath:
+class MapPath(WithoutFrames):
     """The path of one run from x[0] = ``start`` (n,) on, with noise drawn from ``random``. Slots
     must be asked for in order.
     """
-
-    frame_slots: int | None = None
 
     def __init__(
         self, plant: NonlinearPlant, start: FloatArray, random: np.random.Generator
@@ -154,7 +163,3 @@ class MapPath:
         return self._x
 
     local = absolute = state
-
-    def rebase(self, slot: int) -> FloatArray:
-        """Raise IndexError: there are no frames, so that none begins at ``slot``."""
-        raise IndexError(slot)

@@ -23,7 +23,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.plants.dynamics import MOTIONS
 from netkf.plants.plant import Plant
 from netkf.plants.readings import slot_number
-from netkf.plants.truth import TOLERANCE, RecordedTruth, demand_states
+from netkf.plants.truth import TOLERANCE, RecordedTruth, WithoutFrames, demand_states
 
 INTERPOLATIONS = ("linear", "hold")
 """What recorded states are between the rows of their table."""
@@ -131,8 +131,6 @@ class PartlyDrawnTruth(RecordedTruth):
     seconds; coordinates begin at the response ``believed``.
     """
 
-    frame_slots: int | None = None
-
     def __init__(
         self, truth: Any, states: StackedStates, believed: Any, period: float | None
     ) -> None:
@@ -155,10 +153,8 @@ class PartlyDrawnTruth(RecordedTruth):
         return np.where(self._drawn, self._truth.local(time), given)
 
 
-class RecordedPath:
+class RecordedPath(WithoutFrames):
     """The states of slots of ``period`` seconds in a recorded ``truth``."""
-
-    frame_slots: int | None = None
 
     def __init__(self, truth: RecordedTruth, period: float) -> None:
         self._truth, self._period = truth, period
@@ -168,10 +164,6 @@ class RecordedPath:
         return self._truth.local(slot * self._period)
 
     local = absolute = state
-
-    def rebase(self, slot: int) -> FloatArray:
-        """Raise IndexError: a recorded path has no frames, so that none begins at ``slot``."""
-        raise IndexError(slot)
 
 
 state_file = dataclasses.replace(

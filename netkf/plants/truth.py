@@ -176,12 +176,21 @@ class ChangingTruth(SampledTruth):
         self.frame_times = np.empty(0)
 
 
-class RecordedTruth:
+class WithoutFrames:
+    """A truth, in slots or not, whose origin does not move."""
+
+    frame_slots: int | None = None
+    frame_times = np.empty(0)
+
+    def rebase(self, k: int) -> FloatArray:
+        """Raise IndexError: no frame begins, neither number ``k`` nor in a slot ``k``."""
+        raise IndexError(k)
+
+
+class RecordedTruth(WithoutFrames):
     """Known states (K, n) at recorded ``times`` (K,) in seconds, which increase. Between these, up
     to 1e-9 s, states are nan unless ``interpolate`` is "linear", or "hold": the last one counts.
     """
-
-    frame_times = np.empty(0)
 
     def __init__(
         self, times: FloatArray, states: FloatArray, n: int, interpolate: str | None = None
@@ -211,10 +220,6 @@ class RecordedTruth:
         return np.asarray((1.0 - share) * self._states[first] + share * self._states[last])
 
     absolute = local
-
-    def rebase(self, k: int) -> FloatArray:
-        """Raise IndexError: a recorded truth has no frame number ``k``."""
-        raise IndexError(k)
 
     def states(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return local and absolute states (K, n) each at ``times`` (K,), in any order."""
