@@ -30,12 +30,8 @@ from netkf.runs.quantities import ensemble_names
 from netkf.scenario.scenario import Scenario
 from netkf.trace.schema import EVENT
 
-PARTS = (
-    "samples",
-    "averages",
-    "messages",
-    "quantities",
-)  # attributes of RunStatistics that are Moments
+PARTS = "samples", "averages", "messages", "quantities"
+"""Attributes of RunStatistics that are Moments."""
 
 
 class BlockCheckpoints(BlockFiles):
