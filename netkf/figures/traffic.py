@@ -183,27 +183,9 @@ def _last_time(data: FigureData) -> float:
     return last if last > 0.0 else data.scenario.horizon
 
 
-class DirectedMessages(NamedTuple):
-    """The messages from ``sender`` to ``receiver``: the times (s) at which they were ``delivered``,
-    and at which they were ``lost`` or arrived late.
-    """
-
-    sender: int
-    receiver: int
-    delivered: FloatArray
-    lost: FloatArray
-
-
-def messages_by_direction(messages: np.ndarray) -> list[DirectedMessages]:
-    """Return the messages with an outcome of each direction, from MESSAGE rows (M,)."""
-    directions = []
-    for link in by_link(messages):
-        delivered = np.sort(link["ended"][link["outcome"] == DELIVERED])
-        lost = np.sort(link["ended"][~np.isin(link["outcome"], (DELIVERED, UNDER_WAY))])
-        if len(delivered) or len(lost):
-            sender, receiver = int(link["sender"][0]), int(link["receiver"][0])
-            directions.append(DirectedMessages(sender, receiver, delivered, lost))
-    return directions
+def messages_by_direction(messages: np.ndarray) -> list[np.ndarray]:
+    """Return those of the MESSAGE rows (M,) with an outcome, by direction."""
+    return list(by_link(messages[messages["outcome"] != UNDER_WAY]))
 
 
 def links_figure(data: FigureData) -> Picture:
@@ -212,23 +194,20 @@ def links_figure(data: FigureData) -> Picture:
     rows = select_evenly(np.arange(len(directions)), MAX_DIRECTIONS)
     selection = [directions[k] for k in rows.tolist()]
     # As many seconds as have about MAX_MARKS messages.
-    times = np.sort(np.concatenate([np.append(d.delivered, d.lost) for d in selection]))
+    times = np.sort(np.concatenate(selection)["ended"])
     end = float(times[MAX_MARKS]) if len(times) > MAX_MARKS else _last_time(data)
     figure = new_figure(8.4, min(9.0, 2.0 + 0.16 * len(selection)))
     axes = figure.add_subplot()
     for row, direction in enumerate(selection):
-        for times, marker, colour, size in (
-            (direction.delivered, "|", INK, 5.0),
-            (direction.lost, "x", LOST, 4.0),
-        ):
+        for is_heard, marker, colour, size in ((True, "|", INK, 5.0), (False, "x", LOST, 4.0)):
+            times = direction["ended"][heard(direction) == is_heard]
             drawn_times = times[times <= end]
             style: dict[str, Any] = {"ls": "", "marker": marker, "ms": size, "mew": 0.9}
             axes.plot(drawn_times, np.full(len(drawn_times), row), color=colour, **style)
     # Empty series for the legend.
     axes.plot([], [], "|", color=INK, label="delivered")
     axes.plot([], [], "x", color=LOST, label="lost")
-    named = data.scenario.topology.named
-    labels = [f"{plain(named(one.sender))} to {plain(named(one.receiver))}" for one in selection]
+    labels = [" to ".join(_end_names(data, one)) for one in selection]
     axes.set_yticks(range(len(selection)), labels, fontsize=6.5)
     axes.set_ylim(-0.8, len(selection) - 0.2)
     axes.invert_yaxis()
@@ -236,8 +215,8 @@ def links_figure(data: FigureData) -> Picture:
     shade_downtimes(axes, data)
     axes.set(xlabel=SECONDS, ylabel="sender to receiver")
     draw_legend(axes)
-    lost = sum(len(direction.lost) for direction in directions)
-    total = lost + sum(len(direction.delivered) for direction in directions)
+    messages = np.concatenate(directions)
+    lost, total = int((~heard(messages)).sum()), len(messages)
     headline = f"{lost:,} of {total:,} messages were lost ({lost / total:.1%})"
     omissions = []
     if len(selection) < len(directions):
@@ -251,12 +230,22 @@ def links_figure(data: FigureData) -> Picture:
     return figure
 
 
-def _require_messages(data: FigureData) -> list[DirectedMessages]:
+def _require_messages(data: FigureData) -> list[np.ndarray]:
     """Return the messages by direction; raises UnavailableError without any."""
     directions = messages_by_direction(data.joined)
     if not directions:
         raise UnavailableError("No message was delivered or lost.")
     return directions
+
+
+def heard(messages: np.ndarray) -> np.ndarray:
+    """Return flags (M,): whether messages (M,) were delivered, neither lost nor late."""
+    return np.asarray(messages["outcome"] == DELIVERED)
+
+
+def _end_names(data: FigureData, direction: np.ndarray) -> tuple[str, str]:
+    named, first = data.scenario.topology.named, direction[0]
+    return plain(named(int(first["sender"]))), plain(named(int(first["receiver"])))
 
 
 def wilson_interval(delivered: Any, total: Any) -> tuple[Any, Any]:
@@ -271,13 +260,15 @@ def wilson_interval(delivered: Any, total: Any) -> tuple[Any, Any]:
 def delivery_figure(data: FigureData) -> Picture:
     """Draw the delivered shares of directions and losses over time; raises UnavailableError."""
     directions = _require_messages(data)
-    delivered = np.array([len(direction.delivered) for direction in directions])
-    totals = delivered + np.array([len(direction.lost) for direction in directions])
+    delivered = np.array([heard(direction).sum() for direction in directions])
+    totals = np.array([len(direction) for direction in directions])
     shares = delivered / totals
     figure = new_figure(8.4, 4.2)
     left, right = figure.subplots(1, 2, width_ratios=[1.3, 1.0])
-    misses = _draw_shares(left, data, directions, shares)
-    _draw_losses(right, directions, _last_time(data))
+    order = np.argsort(shares, kind="stable")
+    interval = wilson_interval(delivered[order], totals[order])
+    misses = _draw_shares(left, data, [directions[k] for k in order], shares[order], interval)
+    _draw_losses(right, np.concatenate(directions), _last_time(data))
     headline = f"{delivered.sum() / totals.sum():.1%} of {totals.sum():,} messages arrived"
     if shares.min() < shares.max():
         headline += f"; by direction between {shares.min():.0%} and {shares.max():.0%}"
@@ -289,22 +280,20 @@ def delivery_figure(data: FigureData) -> Picture:
 
 
 def _draw_shares(
-    axes: Any, data: FigureData, directions: list[DirectedMessages], shares: FloatArray
+    axes: Any,
+    data: FigureData,
+    directions: list[np.ndarray],
+    shares: FloatArray,
+    interval: tuple[FloatArray, FloatArray],
 ) -> int | None:
     """Draw ``shares`` (L,) with intervals; return how many exclude the stated probability."""
-    order = np.argsort(shares, kind="stable")
-    directions = [directions[k] for k in order.tolist()]
-    delivered = np.array([len(direction.delivered) for direction in directions])
-    low, high = wilson_interval(
-        delivered, delivered + np.array([len(direction.lost) for direction in directions])
-    )
-    positions = np.arange(len(order))
-    width = max(0.4, min(3.0, 150.0 / len(order)))
+    positions, (low, high) = np.arange(len(shares)), interval
+    width = max(0.4, min(3.0, 150.0 / len(shares)))
     axes.vlines(positions, low, high, color=SKY, lw=width, label="95% interval")
-    axes.plot(positions, shares[order], ls="", marker=".", color=INK, ms=4, label="delivered")
+    axes.plot(positions, shares, ls="", marker=".", color=INK, ms=4, label="delivered")
     probabilities = np.full(len(directions), np.nan)
     for k, direction in enumerate(directions):
-        link = direction.sender, direction.receiver
+        link = int(direction["sender"][0]), int(direction["receiver"][0])
         # A user's class of losses may have no mean, or raise.
         with contextlib.suppress(ArithmeticError, LookupError, TypeError, ValueError):
             probabilities[k] = float(data.scenario.mean_delivery(link))
@@ -315,8 +304,7 @@ def _draw_shares(
         misses = int(((probabilities < low) | (probabilities > high)).sum())
     axes.set_ylim(-0.02, 1.04)
     if len(directions) <= MAX_LABELLED:
-        named = data.scenario.topology.named
-        names = [f"{plain(named(d.sender))}>{plain(named(d.receiver))}" for d in directions]
+        names = [">".join(_end_names(data, direction)) for direction in directions]
         rotation = 90 if len(names) * max(map(len, names)) > 24 else 0
         axes.set_xticks(positions, names, fontsize=6.5, rotation=rotation)
         axes.set_xlabel("direction, sender > receiver")
@@ -327,11 +315,11 @@ def _draw_shares(
     return misses
 
 
-def _draw_losses(axes: Any, directions: list[DirectedMessages], end: float) -> None:
-    """Draw the share of messages lost in TIME_BINS intervals until ``end`` s."""
+def _draw_losses(axes: Any, messages: np.ndarray, end: float) -> None:
+    """Draw the share of ``messages`` (M,) lost in TIME_BINS intervals until ``end`` s."""
     edges = np.linspace(0.0, end, TIME_BINS + 1)
-    lost = np.histogram(np.concatenate([d.lost for d in directions]), edges)[0]
-    totals = lost + np.histogram(np.concatenate([d.delivered for d in directions]), edges)[0]
+    lost = np.histogram(messages["ended"][~heard(messages)], edges)[0]
+    totals = np.histogram(messages["ended"], edges)[0]
     bins = np.flatnonzero(totals)
     low, high = wilson_interval(lost[bins], totals[bins])
     centres = 0.5 * (edges[1:] + edges[:-1])[bins]
