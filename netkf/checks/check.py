@@ -41,7 +41,8 @@ from netkf.checks.evidence import (
 from netkf.checks.exact import promised_filter, with_base_filter, with_promised_filter
 from netkf.checks.looks import MAX_LOOKED_RUNS, is_decided, keep_decisions, level_of_look, next_runs
 from netkf.checks.paper import PaperChecks
-from netkf.checks.parts.rows import gaussian_noises, part_assumptions, part_promises
+from netkf.checks.parts.network_rows import loss_assumptions
+from netkf.checks.parts.rows import gaussian_noises, part_promises
 from netkf.checks.parts.samples import stack_parts, summarise_parts
 from netkf.checks.points import check_slots, probe_times
 from netkf.checks.records.rows import audit_record, audit_run, record_promises
@@ -298,7 +299,7 @@ def judge_replicas(
     rows += judge(
         part_promises(parts),
         parts,
-        assumptions=part_assumptions(parts),
+        assumptions=loss_assumptions(scenario),
         runs=len(replicas),
         level=0.5 * (1.0 - confidence),
     )

@@ -55,13 +55,11 @@ def law_distance(
     return _band_interval(gaps, len(first), len(second), level, grow=False)
 
 
-def law_excess(
-    first: FloatArray, second: FloatArray, level: float, rounding: float = 0.0
-) -> Interval:
+def law_excess(first: FloatArray, second: FloatArray, level: float) -> Interval:
     """Return an interval for the largest ``P(second > x) - P(first > x)`` of samples (S,) and
     (S',), to both of which further runs add.
     """
-    gaps = _ecdf_gaps(first, second, rounding)
+    gaps = _ecdf_gaps(first, second, rounding=0.0)
     return _band_interval(gaps, len(first), len(second), level, grow=True)
 
 

@@ -54,28 +54,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _run_command(arguments, interruption)
 
 
-class _Outcome:
-    """The exit status of a command and its message on standard error, empty if there is none."""
-
-    def __init__(self, status: int, message: str = "") -> None:
-        self.status, self.message = status, message
-
-
 def _run_command(arguments: Sequence[str], interruption: Interruption) -> int:
     """Run a command line and print its error; signals raise KeyboardInterrupt while armed."""
     with safe_streams():
         try:
             interruption.arm()
-            outcome = _execute(arguments, interruption)
+            status, message = _execute(arguments, interruption)
             interruption.disarm()
         except KeyboardInterrupt as interrupt:
-            outcome = _report_interrupt(str(interrupt))
-        if outcome.message:
-            print(f"netkf: {one_line(outcome.message)}", file=sys.stderr)
-    return outcome.status
+            status, message = _report_interrupt(str(interrupt))
+        if message:
+            print(f"netkf: {one_line(message)}", file=sys.stderr)
+    return status
 
 
-def _execute(arguments: Sequence[str], interruption: Interruption) -> _Outcome:
+def _execute(arguments: Sequence[str], interruption: Interruption) -> tuple[int, str]:
+    """Return the exit status of a command and its message on standard error, "" without one."""
     try:
         parser = make_parser()
         options = parser.parse_args(arguments)
@@ -86,7 +80,7 @@ def _execute(arguments: Sequence[str], interruption: Interruption) -> _Outcome:
         sys.stdout.flush()
     except OutputError as error:
         discard_output()
-        return _Outcome(BAD_USAGE, f"cannot write: {_error_reason(error.__cause__)}")
+        return BAD_USAGE, f"cannot write: {_error_reason(error.__cause__)}"
     except Exception as error:
         message = _describe_error(error)
         # A library may turn an interrupt into an error of its own, or fail while the command ends.
@@ -96,14 +90,14 @@ def _execute(arguments: Sequence[str], interruption: Interruption) -> _Outcome:
             import traceback
 
             traceback.print_exception(error)
-            return _Outcome(BAD_USAGE, f"failed with {type(error).__name__}, see above")
-        return _Outcome(BAD_USAGE, message)
-    return _Outcome(status)
+            return BAD_USAGE, f"failed with {type(error).__name__}, see above"
+        return BAD_USAGE, message
+    return status, ""
 
 
-def _report_interrupt(detail: str) -> _Outcome:
+def _report_interrupt(detail: str) -> tuple[int, str]:
     """Return the outcome of an interrupted command; ``detail`` says what was kept, if known."""
-    return _Outcome(INTERRUPTED, f"interrupted; {detail}" if detail else "interrupted")
+    return INTERRUPTED, f"interrupted; {detail}" if detail else "interrupted"
 
 
 def _describe_error(error: Exception) -> str | None:

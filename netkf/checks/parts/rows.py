@@ -10,7 +10,7 @@ import scipy
 
 from netkf.checks.evidence import GAUSSIAN, PLANT, SENSORS, START, Assumption, Finding, Promise
 from netkf.checks.laws import find
-from netkf.checks.parts.network_rows import loss_assumptions, network_promises
+from netkf.checks.parts.network_rows import network_promises
 from netkf.checks.parts.noises import path_law, reading_labels, start_states, whitened_starts
 from netkf.checks.parts.samples import PartSamples
 from netkf.laws.noise import (
@@ -114,11 +114,6 @@ SENSOR_ROWS = _rows(
     ("noises of the sensors have their covariance", _variance),
     ("noises of the sensors are white and independent of each other", _correlation),
 )
-
-
-def part_assumptions(samples: PartSamples) -> list[Assumption]:
-    """Return the assumptions of the tests of a scenario's parts, each with whether it holds."""
-    return loss_assumptions(samples.scenario)
 
 
 def part_promises(samples: PartSamples) -> tuple[Promise, ...]:
