@@ -20,6 +20,7 @@ from netkf.logs.packet_tables import find_extra, read_positions
 from netkf.logs.packets import (
     PacketLog,
     choose_origin,
+    note_count,
     parse_numbers,
     parse_stamps,
     read_texts,
@@ -49,8 +50,7 @@ def read_mercator(log: Path) -> PacketLog:
     table = pd.concat([part[0] for part in parts], ignore_index=True)
     table["t"] = [float(stamp - origin) for stamp in stamps]
     repeated = table.duplicated([*NUMBERS, "mac", "srcmac", "t"])
-    if repeated.any():
-        notes.append(f"merged: {count_phrase(int(repeated.sum()), 'row')} that repeat a packet")
+    note_count(notes, repeated.sum(), "row", "merged: {} that repeat a packet")
     _count_from_zero(table, notes, str(log))
     table["burst"] = _number_bursts(table, notes)
     sends, off = _transmissions(table)
@@ -59,10 +59,7 @@ def read_mercator(log: Path) -> PacketLog:
         f"{count_phrase(len(sends), 'packet')}; stamps are whole seconds, so that packets "
         "stand at pkctr * txifdur from a beginning of their burst that fits its stamps"
     )
-    if off:
-        notes.append(
-            f"moved: {count_phrase(off, 'burst')} whose stamps fit no beginning: the middle counts"
-        )
+    note_count(notes, off, "burst", "moved: {} whose stamps fit no beginning: the middle counts")
     spread_equal(sends, 1e-3, notes)
     sends = sends.sort_values("t", kind="stable").reset_index(drop=True)
     place = pd.Series(sends.index, index=[sends["burst"], sends["number"]])
@@ -88,9 +85,8 @@ def _read(path: Path, notes: list[str]) -> tuple[pd.DataFrame, list[Decimal]]:
     expected, right = (raw[name].str.lower().isin(YES) for name in ("expected", "crc"))
     foreign, broken, good = ~expected, expected & ~right, raw[expected & right]
     notes.append(f"used: {path.name}: {len(good):,} of {count_phrase(len(raw), 'row')}")
-    for what, flags in (("of no packet of the experiment", foreign), ("with a wrong crc", broken)):
-        if flags.any():
-            notes.append(f"dropped: {count_phrase(int(flags.sum()), 'row')} {what}")
+    note_count(notes, foreign.sum(), "row", "dropped: {} of no packet of the experiment")
+    note_count(notes, broken.sum(), "row", "dropped: {} with a wrong crc")
     numbers: dict[str, Any] = {name: parse_numbers(path, good, name) for name in NUMBERS}
     numbers["rssi"] = parse_numbers(path, good, "rssi") if "rssi" in good.columns else np.nan
     table = pd.DataFrame({"mac": good["mac"], "srcmac": good["srcmac"], **numbers})
@@ -132,11 +128,11 @@ def _number_bursts(table: pd.DataFrame, notes: list[str]) -> np.ndarray:
         notes.append(f"used: numbers of bursts begin again: {int(again.sum()):,} bursts")
     numbers = sorted(set(table["transctr"].astype(int)))
     silent = numbers[-1] - numbers[0] + 1 - len(numbers)
-    if silent:
-        notes.append(
-            f"not known: {count_phrase(silent, 'burst')} that numbers tell of and no mote "
-            "reported: who sent them, and when, is in no row, so that they are not in the replay"
-        )
+    text = (
+        "not known: {} that numbers tell of and no mote reported: who sent them, and when, is in "
+        "no row, so that they are not in the replay"
+    )
+    note_count(notes, silent, "burst", text)
     return np.asarray((~same | again).cumsum().reindex(table.index))
 
 

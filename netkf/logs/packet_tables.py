@@ -20,6 +20,7 @@ from netkf.logs.packets import (
     choose_origin,
     find_lead,
     find_resolution,
+    note_count,
     parse_numbers,
     parse_stamps,
     read_texts,
@@ -372,14 +373,10 @@ def _number_transmissions(table: pd.DataFrame, notes: list[str], log: str) -> pd
     if wraps:
         lengths = " or ".join(map(str, sorted(moduli)))
         notes.append(f"used: numbers wrap after {lengths}: {count_phrase(wraps, 'time')}")
-    if restarts:
-        notes.append(
-            f"used: numbers begin again {count_phrase(restarts, 'time')}; what was sent between is "
-            "not known"
-        )
-    if missing:
-        phrase = count_phrase(missing, "row")
-        notes.append(f"used: {phrase} without a number: equal stamps of a sender are one packet")
+    text = "used: numbers begin again {}; what was sent between is not known"
+    note_count(notes, restarts, "time", text)
+    text = "used: {} without a number: equal stamps of a sender are one packet"
+    note_count(notes, missing, "row", text)
     return keys
 
 
@@ -443,16 +440,10 @@ def _skipped(sends: pd.DataFrame, notes: list[str]) -> pd.DataFrame:
                 row = {"sender": sender, "t": round(t, 9), "channel": channel, "to": to}
                 row |= {"counter": counter, "sent": False, "logged": False}
                 found.append(row)
-    if found:
-        notes.append(
-            f"not known: {count_phrase(len(found), 'transmission')} that numbers tell of and no "
-            "row does; they stand between their neighbours in time"
-        )
-    if left_out:
-        notes.append(
-            f"not known: {count_phrase(left_out, 'transmission')} between numbers more than "
-            f"{MAX_SKIP:,} apart; these are not in the replay"
-        )
+    text = "that numbers tell of and no row does; they stand between their neighbours in time"
+    note_count(notes, len(found), "transmission", "not known: {} " + text)
+    text = f"between numbers more than {MAX_SKIP:,} apart; these are not in the replay"
+    note_count(notes, left_out, "transmission", "not known: {} " + text)
     columns = ["sender", "t", "channel", "to", "counter", "sent", "logged"]
     keys = [_key(row["sender"], row["to"], row["counter"]) for row in found]
     return pd.DataFrame(found, columns=columns, index=keys)
@@ -507,12 +498,10 @@ def read_positions(path: Path, origin: Decimal, notes: list[str]) -> pd.DataFram
     table = pd.DataFrame({"t": times, "node": raw[name].to_numpy(), **columns}, index=raw.index)
     _refuse_two_places(path, table, "one position" + (" at a time" if stamp else ""))
     kept = table.drop_duplicates(["t", "node"]).sort_values(["t", "node"], kind="stable")
-    if len(kept) < len(table):
-        notes.append(f"merged: {count_phrase(len(table) - len(kept), 'row')} of {path.name}")
+    note_count(notes, len(table) - len(kept), "row", "merged: {} of " + path.name)
     # The first place of a node that was placed later counts from the beginning.
     late = (kept["t"] > 0.0) & ~kept.duplicated("node")
-    if late.any():
-        notes.append(f"moved: first places of {count_phrase(int(late.sum()), 'node')} to time 0")
+    note_count(notes, late.sum(), "node", "moved: first places of {} to time 0")
     kept["t"] = kept["t"].where(~late, 0.0)
     return kept.reset_index(drop=True) if stamp else kept.drop(columns="t")
 
@@ -541,7 +530,6 @@ def read_readings(path: Path, origin: Decimal, notes: list[str], column: str = "
     if unused:
         notes.append(f"not used: {path.name}: columns {', '.join(unused)}, but {used} as y0")
     is_empty, is_early = table["y0"].isna(), table["t"] < 0.0
-    for dropped, why in ((is_empty, "without a value"), (is_early & ~is_empty, "before time 0")):
-        if dropped.any():
-            notes.append(f"dropped: {count_phrase(int(dropped.sum()), 'reading')} {why}")
+    note_count(notes, is_empty.sum(), "reading", "dropped: {} without a value")
+    note_count(notes, (is_early & ~is_empty).sum(), "reading", "dropped: {} before time 0")
     return table[~(is_empty | is_early)].reset_index(drop=True)

@@ -268,6 +268,12 @@ def _begin_at(numbers: np.ndarray, first: int | None, modulus: int) -> np.ndarra
     return np.argsort((numbers - first) % modulus, kind="stable")
 
 
+def note_count(notes: list[str], count: float, what: str, text: str) -> None:
+    """Add a note: ``text`` with a count of ``what`` in place of {}, unless it is 0."""
+    if count:
+        notes.append(text.replace("{}", count_phrase(int(count), what), 1))
+
+
 def spread_equal(sends: pd.DataFrame, resolution: float, notes: list[str]) -> None:
     """Move transmissions of a sender with one stamp apart, within ``resolution`` (s)."""
     key = [sends["sender"], sends["to"], sends["t"]]
@@ -304,11 +310,8 @@ def settle(log: PacketLog, hole: float, unreported: str) -> pd.DataFrame:
             why[silent] = np.where(_sent_all_that_was_heard(sends)[send], NOT_LOGGED, UNREPORTED)[
                 silent
             ]
-        if silent.any():
-            log.notes.append(
-                f"not known: {count_phrase(int(silent.sum()), 'outcome')} of transmissions that "
-                f"nobody reported, of which only their numbers tell; taken as {unreported}"
-            )
+        text = "not known: {} of transmissions that nobody reported, of which only their numbers "
+        note_count(log.notes, silent.sum(), "outcome", f"{text}tell; taken as {unreported}")
         why[_in_holes(log, whole, hole)] = "the receiver's log has a hole"
     whole["heard"] = np.where(missing, 0.0, whole["heard"].to_numpy(dtype=float))
     whole.loc[why != "", "heard"] = np.nan

@@ -13,7 +13,7 @@ import pandas as pd
 from netkf.core.errors import ScenarioError
 from netkf.core.printable import count_phrase
 from netkf.core.stamps import TimeBase
-from netkf.logs.packets import PacketLog, accounts, settle
+from netkf.logs.packets import PacketLog, accounts, note_count, settle
 from netkf.network.clocks import LinkClock, OnReadings
 from netkf.network.matchings import Matching
 from netkf.scenario.scenario import Scenario
@@ -132,10 +132,7 @@ def _note_totals(log: PacketLog, account: pd.DataFrame) -> None:
     """Note how many links and outcomes the ``account`` of a log has."""
     nodes = len({*account["sender"], *account["receiver"]})
     apart = nodes * (nodes - 1) - len(account)
-    if apart:
-        log.notes.append(
-            f"used: {count_phrase(apart, 'pair')} that never heard each other: no link"
-        )
+    note_count(log.notes, apart, "pair", "used: {} that never heard each other: no link")
     total = account[["sent", "heard", "lost", "unknown"]].sum()
     log.notes.append(
         f"outcomes: {total['sent']:,} = {total['heard']:,} heard + {total['lost']:,} lost + "
@@ -253,9 +250,8 @@ def _own_scenario(
 def _of_network(log: PacketLog, table: pd.DataFrame, nodes: list[str], what: str) -> pd.DataFrame:
     """Return the rows of ``nodes``, the others being noted."""
     own = table[table["node"].isin(nodes)] if len(table) else table
-    if len(own) < len(table):
-        count = count_phrase(len(table) - len(own), what)
-        log.notes.append(f"dropped: {count} of nodes that are not in the network")
+    left_out, text = len(table) - len(own), "dropped: {} of nodes that are not in the network"
+    note_count(log.notes, left_out, what, text)
     return own
 
 

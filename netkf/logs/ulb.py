@@ -18,6 +18,7 @@ from netkf.logs.packet_tables import find_column, find_extra, read_positions, re
 from netkf.logs.packets import (
     PacketLog,
     find_resolution,
+    note_count,
     parse_numbers,
     parse_stamps,
     read_texts,
@@ -64,9 +65,8 @@ def read_ulb(log: Path) -> PacketLog:
     )
     kept = reports.drop_duplicates(["sender", "receiver", "minute"])
     kept = kept[kept["sender"] != kept["receiver"]]
-    if len(kept) < len(reports):
-        rows = count_phrase(len(reports) - len(kept), "row")
-        notes.append(f"merged: {rows} of reports that name a sender again, or the mote itself")
+    text = "merged: {} of reports that name a sender again, or the mote itself"
+    note_count(notes, len(reports) - len(kept), "row", text)
     sends = _broadcasts(readings, kept, notes)
     spread_equal(sends, find_resolution(read_stamps), notes)
     sends = sends.sort_values("t", kind="stable").reset_index(drop=True)
@@ -110,14 +110,10 @@ def _broadcasts(readings: pd.DataFrame, reports: pd.DataFrame, notes: list[str])
     named = named.merge(sends[["sender", "minute"]], how="left", indicator=True)
     extra = named[named["_merge"] == "left_only"][["sender", "minute"]]
     extra["t"] = (MINUTE * extra["minute"] + extra["sender"].map(usual).astype(float)).round(3)
-    if len(extra):
-        notes.append(
-            f"used: {count_phrase(len(extra), 'broadcast')} without a reading, which reports name, "
-            "at the usual second of the mote"
-        )
+    text = "used: {} without a reading, which reports name, at the usual second of the mote"
+    note_count(notes, len(extra), "broadcast", text)
     again = len(readings) - len(sends)
-    if again:
-        notes.append(f"merged: {count_phrase(again, 'reading')} in a minute that has one already")
+    note_count(notes, again, "reading", "merged: {} in a minute that has one already")
     both = pd.concat([sends, extra], ignore_index=True)
     at_zero = both["t"] == 0.0
     if at_zero.any():
@@ -135,14 +131,9 @@ def _outcomes(sends: pd.DataFrame, reports: pd.DataFrame, notes: list[str]) -> p
     told = pd.MultiIndex.from_frame(reports[["receiver", "minute"]].drop_duplicates())
     is_told = pd.MultiIndex.from_frame(whole[["receiver", "minute"]]).isin(told)
     whole["heard"] = np.where(is_told, whole["heard"].fillna(0.0), np.nan)
-    count = int(whole["heard"].isna().sum())
-    if count:
-        notes.append(
-            f"not known: {count_phrase(count, 'outcome')} in minutes of which the receiver's "
-            "report is missing"
-        )
+    text = "not known: {} in minutes of which the receiver's report is missing"
+    note_count(notes, whole["heard"].isna().sum(), "outcome", text)
     unused = len(reports) - int((whole["heard"] == 1.0).sum())
-    if unused:
-        rows = count_phrase(unused, "row")
-        notes.append(f"dropped: {rows} of reports on motes or minutes without a broadcast")
+    text = "dropped: {} of reports on motes or minutes without a broadcast"
+    note_count(notes, unused, "row", text)
     return whole[["send", "receiver", "heard", "rssi"]].assign(delay=np.nan)
