@@ -55,8 +55,17 @@ def test_the_bound_goes_to_0_with_the_noises(regression):
     assert found.shape < theory.tracking_level(regression).shape
 
 
+def test_a_high_moment_does_not_overflow(regression):
+    """The norm of order p tends to the largest of the draws."""
+    high, higher = (theory.tracking_level(regression, p, samples=1000) for p in (400.0, 1e300))
+    assert high.sigma < higher.sigma < 1.02 * high.sigma
+    assert high.low < high.sigma < high.high
+
+
 def test_wrong_arguments(regression):
     with pytest.raises(TheoryError, match="beta > 2"):
         theory.tracking_level(regression, beta=2.0)
+    with pytest.raises(TheoryError, match="beyond floating point"):
+        theory.tracking_level(regression, beta=1e6)
     with pytest.raises(TheoryError, match="law"):
         theory.tracking_level(netkf.load(SCENARIOS / "poisson_ring.toml"))

@@ -291,12 +291,17 @@ def tracking_level(
         raise TheoryError(f"D (29) needs p >= 1 and beta > 2, got {p!r} and {beta!r}")
     samples, seed = as_integer("samples", samples, 100), as_integer("seed", seed, 0, np.inf)
     xi = _draw_noises(scenario, samples, Streams(seed).generator("noises"))
-    powers = (xi * np.log(math.e + xi) ** beta) ** p
+    with np.errstate(over="ignore"):
+        values = xi * np.log(math.e + xi) ** beta
+    largest = float(values.max()) or 1.0
+    if not math.isfinite(largest):
+        raise TheoryError(f"xi log^beta(e + xi) of D (29) is beyond floating point for {beta!r}")
+    powers = (values / largest) ** p  # of numbers up to 1, which do not overflow
     mean, error = float(powers.mean()), QUANTILE * float(powers.std(ddof=1)) / math.sqrt(samples)
-    ends = (max(mean - error, 0.0) ** (1.0 / p), (mean + error) ** (1.0 / p))
-    sigma = mean ** (1.0 / p)
+    low, high = (largest * end ** (1.0 / p) for end in (max(mean - error, 0.0), mean + error))
+    sigma = largest * mean ** (1.0 / p)
     shape = sigma * math.log(math.e + 1.0 / sigma) ** (1.0 + beta / 2.0) if sigma > 0.0 else 0.0
-    return TrackingLevel(sigma, *ends, shape)
+    return TrackingLevel(sigma, low, high, shape)
 
 
 def _draw_noises(scenario: Scenario, samples: int, random: np.random.Generator) -> FloatArray:
