@@ -15,6 +15,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,8 +53,8 @@ class Innovations(NamedTuple):
     deviations : M arrays (p,), square roots of the diagonal of S
     log_density : (M,) log density of v, normal with covariance S
     increments : number of readings that are increments
-    components : M arrays (p,), which of all values that sensors of the node give they are, from 0;
-                 None if they are counted in each reading
+    components : M arrays (p,), which of all values that sensors of the node give they are, from 0,
+                 or None where that is unknown
     """
 
     times: FloatArray
@@ -65,12 +66,12 @@ class Innovations(NamedTuple):
     deviations: list[FloatArray]
     log_density: FloatArray
     increments: int = 0
-    components: list[np.ndarray] | None = None
+    components: Sequence[np.ndarray | None] = ()
 
 
 class Recorded(NamedTuple):
-    """The innovation ``value`` (p,) of a reading, nan without a finite P, and the Cholesky factor
-    ``root`` (p, p) of its covariance.
+    """The innovation ``value`` (p,) of a reading, nan without a finite P, the Cholesky factor
+    ``root`` (p, p) of its covariance, and ``H`` (p, n) of a sample.
     """
 
     time: float
@@ -78,6 +79,7 @@ class Recorded(NamedTuple):
     value: FloatArray
     root: FloatArray
     of_increments: bool
+    H: FloatArray | None = None
 
     @property
     def whitened(self) -> FloatArray:
@@ -177,10 +179,11 @@ class Recorder(Filter):
         if innovation is not None:
             time = reading.time if sampled else state.time
             node = -1 if self.timing.pooled else state.info.node
-            self.recorded.append(Recorded(time, node, *innovation, not sampled))
+            value, root, *H = innovation
+            self.recorded.append(Recorded(time, node, value, root, not sampled, *H))
         return state._replace(inner=self.inner.update(state.inner, reading))
 
-    def _of_sample(self, state: TimedState, reading: Any) -> tuple[FloatArray, FloatArray] | None:
+    def _of_sample(self, state: TimedState, reading: Any) -> tuple[FloatArray, ...] | None:
         xhat, P = self.inner.estimate(state.inner)
         # How errors of other blocks correlate is not known.
         rows = slice(None) if self.timing.pooled else state.info.is_own(reading.H)
@@ -188,12 +191,10 @@ class Recorder(Filter):
         if not len(y):
             return None
         if P is None or not np.isfinite(P).all():
-            return np.full(len(y), np.nan), np.eye(len(y))
-        return y - H @ xhat, np.linalg.cholesky(H @ P @ H.T + R)
+            return np.full(len(y), np.nan), np.eye(len(y)), H
+        return y - H @ xhat, np.linalg.cholesky(H @ P @ H.T + R), H
 
-    def _of_increments(
-        self, state: TimedState, reading: Any
-    ) -> tuple[FloatArray, FloatArray] | None:
+    def _of_increments(self, state: TimedState, reading: Any) -> tuple[FloatArray, ...] | None:
         (xhat, P), model = state.start, state.inner.model
         if P is None or not np.isfinite(P).all():
             return None
@@ -241,7 +242,27 @@ def compute_innovations(run: Run, max_events: int = MAX_EVENTS) -> Innovations:
         one for one in recorder.recorded if one.of_increments or one.time < scenario.horizon
     ]
     recorded.sort(key=lambda one: one.time)
-    return tabulate(recorded)
+    which = cache(lambda node: _rows_read(scenario, node))
+    components = [_components(one, which(one.node)) for one in recorded]
+    return tabulate(recorded)._replace(components=components)
+
+
+def _rows_read(scenario: Scenario, node: int) -> list[tuple[float, ...]]:
+    """Return the rows of H of all that a ``node`` (-1: all) reads; none where they vary."""
+    sensors = scenario.sensors_of(node)
+    if any(
+        not s.linear or (s.varying if s.record is None else s.record.regressors) for s in sensors
+    ):
+        return []
+    view = slice(None) if node < 0 else scenario.view(scenario.nodes.index(node))
+    return [tuple(row[view]) for s in sensors for row in s.matrix_of(scenario.plant.n)]
+
+
+def _components(one: Recorded, rows: list[tuple[float, ...]]) -> np.ndarray | None:
+    found = [] if one.H is None else list(map(tuple, one.H))
+    if not found or not set(found) <= set(rows):
+        return None
+    return np.arange(len(rows)) if found == rows else np.array(list(map(rows.index, found)))
 
 
 def tabulate(recorded: Sequence[Recorded]) -> Innovations:

@@ -384,9 +384,13 @@ class ScenarioModel(Component):
         """Return labels of the values that sensors of a ``node`` (-1: of all) read, in order."""
         of_plants = [enumerate(plant.labels) for _, plant in self.all_plants]
         states = [x and self._column_label(k, {x}) for plant in of_plants for k, x in plant]
-        owners = [node] if node >= 0 else [*self.placed_sensors]
-        placed = [self.sensors[p.entry] for i in owners for p in self.placed_sensors.get(i, ())]
+        placed = self.sensors_of(node)
         return [label for sensor in placed for label in self._value_labels(sensor, states)]
+
+    def sensors_of(self, node: int) -> list[Sensor]:
+        """Return the sensors of a ``node`` (-1: of all) in the order of its values."""
+        owners = [node] if node >= 0 else [*self.placed_sensors]
+        return [self.sensors[p.entry] for i in owners for p in self.placed_sensors.get(i, ())]
 
     def _value_labels(self, sensor: Sensor, states: Sequence[str]) -> Iterator[str]:
         if isinstance(sensor, PositionedSensor):

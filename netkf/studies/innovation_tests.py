@@ -245,8 +245,9 @@ def _judge_node(
     nis, rows, is_white = recorded.nis[chosen], recorded.rows[chosen], law.kind == "white"
     freedom, mean = float(rows.sum()), float(nis.sum() / rows.sum())
     whitened = [recorded.whitened[i] for i in chosen]
-    given = recorded.components
-    places = [np.arange(p) for p in rows] if given is None else [given[i] for i in chosen]
+    given = [recorded.components[i] for i in chosen] if recorded.components else [None]
+    known = [one for one in given if one is not None]
+    places = known if len(known) == len(chosen) else [np.arange(p) for p in rows]
     flat, of = np.concatenate(whitened), np.concatenate(places)
     columns = [flat[of == c] for c in np.unique(of)]
     # Correlated readings count as fewer independent ones.
@@ -257,7 +258,7 @@ def _judge_node(
         low, high = (float(end) for end in chi_square_interval(counted, 1.0 - level))
         detectable = high / (2.0 * float(gammaincinv(0.5 * counted, 1.0 - POWER)) / counted)
     bias, reach, found, component = _bias(recorded, chosen, of, inflation, level)
-    label = scenario.label_of_value(node, component, rows if given is None else None)
+    label = scenario.label_of_value(node, component, None if places is known else rows)
     lags = min(LAGS, max(map(len, columns)) // 5)
     columns = [column for column in columns if len(column) >= MIN_READINGS]
     statistic = p = correlation = math.nan

@@ -301,18 +301,20 @@ def test_what_is_biased_has_its_name_and_unit(tmp_path):
     assert " of " not in format_innovations(alone).splitlines()[0]
 
 
-def test_values_of_the_central_filter_are_told_apart(tmp_path):
-    """It takes them one by one: biases of two values, or of two sensors at times of their own, do
-    not cancel. A sensor that is bad is still that of its node.
+@pytest.mark.parametrize("kind", ["central", "local"])
+def test_values_of_a_node_are_told_apart(tmp_path, kind):
+    """The central filter takes them one by one, and sensors have times of their own, or rows with
+    missing values: biases do not cancel. A sensor that is bad is that of its node.
     """
     clock = WALK["sensors"][0]["sampling"]
     fault = {"kind": "biased", "size": [2.0, -2.0]}
     pair = {"nodes": [1], "H": np.eye(2).tolist(), "R": np.eye(2).tolist(), "sampling": clock}
-    first, second = ({**pair, "H": [row], "R": [[1.0]]} for row in np.eye(2).tolist())
-    faults = ({"fault": {"kind": "biased", "size": [size]}} for size in (2.0, -2.0))
-    apart = [{**one, **bad} for one, bad in zip((first, second), faults, strict=True)]
+    apart = [
+        {**pair, "H": [row], "R": [[1.0]], "fault": {**fault, "size": [size]}}
+        for row, size in zip(np.eye(2).tolist(), fault["size"], strict=True)
+    ]
     for sensors in ([{**pair, "fault": fault}], apart):
-        changed = {"horizon": 60.0, "sensors": sensors, "filter": {"kind": "central"}}
+        changed = {"horizon": 60.0, "sensors": sensors, "filter": {"kind": kind}}
         (row,) = netkf.innovations(from_table({**NAMED, **changed}, tmp_path)).rows
         assert (row.node, row.label in ("height (m)", "speed (m/s)")) == (1, True)
         assert abs(row.bias) > 1.0
