@@ -29,6 +29,7 @@ from netkf.figures.style import (
     plain,
 )
 from netkf.linalg.arrays import FloatArray
+from netkf.runs.connectivity import newest_heard, sent_at
 from netkf.trace.messages import DELIVERED, UNDER_WAY, by_link
 from netkf.trace.schema import CODES
 
@@ -40,14 +41,6 @@ MAX_LABELLED = 16  # directions whose names fit below the axis
 MAX_MARKS = 3000  # messages that can still be told apart
 CONFIDENCE = 0.95
 TIME_BINS = 30  # of time: each has enough messages for an interval
-
-
-def newest_arrivals(log: np.ndarray, node: int) -> tuple[FloatArray, FloatArray]:
-    """Return arrivals (K,) at ``node`` and when the newest message so far was sent, in seconds."""
-    arrivals = log[(log["kind"] == CODES["deliver"]) & (log["node"] == node)]
-    # A message that overtakes others makes them old before they arrive.
-    sent = np.maximum.accumulate(arrivals["t"] - np.nan_to_num(arrivals["age"]))
-    return arrivals["t"], sent
 
 
 class AgeSawtooth(NamedTuple):
@@ -99,11 +92,10 @@ def _sum_excess(values: FloatArray, levels: FloatArray) -> FloatArray:
 
 def age_of_information(log: np.ndarray, node: int, end: float) -> AgeSawtooth:
     """Return the time since the newest arrived message was sent, until ``end`` (s)."""
-    arrived, sent = newest_arrivals(log, node)
-    before_end = arrived < end
-    start = np.concatenate([[0.0], arrived[before_end]])
-    stop = np.concatenate([arrived[before_end], [end]])
-    return AgeSawtooth(start, stop, start - np.concatenate([[0.0], sent[before_end]]))
+    arrivals = log[(log["kind"] == CODES["deliver"]) & (log["node"] == node) & (log["t"] < end)]
+    start = np.concatenate([[0.0], arrivals["t"]])
+    stop = np.concatenate([arrivals["t"], [end]])
+    return AgeSawtooth(start, stop, start - newest_heard(start[1:], sent_at(arrivals), start))
 
 
 def age_figure(data: FigureData) -> Picture:

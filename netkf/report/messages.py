@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
+from netkf.runs.connectivity import newest_heard
 from netkf.trace.messages import DELIVERED, LATE, LOST, UNDER_WAY, by_link
 
 
@@ -50,11 +51,8 @@ def information_age(
         column = int(np.searchsorted(nodes, link["receiver"][0]))
         arrived = link[link["outcome"] == DELIVERED]
         arrived = arrived[np.argsort(arrived["ended"], kind="stable")]
-        # A message that overtakes another one is newer: the age does not grow when the late one
-        # arrives. The first entry is for times before the first arrival.
-        newest_sent = np.concatenate([[0.0], np.maximum.accumulate(arrived["sent"])])
-        last_sent = newest_sent[np.searchsorted(arrived["ended"], cutoffs, side="right")]
-        total[:, column] += np.maximum(0.0, times - last_sent)
+        newest = newest_heard(arrived["ended"], arrived["sent"], cutoffs)
+        total[:, column] += np.maximum(0.0, times - newest)
         links[column] += 1.0
     with np.errstate(invalid="ignore"):
         return np.asarray(total / np.where(links > 0.0, links, np.nan))

@@ -171,7 +171,7 @@ class ConnectivitySink(Sink):
         rows, link = rows[order], (sender * size + receiver)[order]
         for i, j in self._ends.tolist():
             first, last = np.searchsorted(link, [i * size + j, i * size + j + 1])
-            yield newest_heard(rows[first:last], t)
+            yield newest_heard(rows["t"][first:last], sent_at(rows[first:last]), t)
 
     def entry(self) -> dict[str, Any]:
         """Return the entry of summary.json: share of samples connected, mean number of components,
@@ -202,9 +202,15 @@ class ConnectivitySink(Sink):
             return np.append(self.nodes_connected, self.connected) / np.float64(self.count)
 
 
-def newest_heard(arrivals: np.ndarray, t: FloatArray) -> FloatArray:
-    """Return when the newest message that arrived by ``t`` (T,) was sent (s), 0 without one."""
+def sent_at(arrivals: np.ndarray) -> FloatArray:
+    """Return when the messages of EVENT rows (K,) of kind deliver were sent, in seconds."""
+    return np.asarray(arrivals["t"] - np.nan_to_num(arrivals["age"]))
+
+
+def newest_heard(arrived: FloatArray, sent: FloatArray, t: FloatArray) -> FloatArray:
+    """Return when the newest message that arrived by ``t`` (T,) was sent (s), 0 without one, of
+    messages in the order in which they ``arrived`` (K,).
+    """
     # A message that overtakes others makes them old before they arrive.
-    sent = np.maximum.accumulate(arrivals["t"] - np.nan_to_num(arrivals["age"]))
-    place = np.searchsorted(arrivals["t"], t, side="right")
-    return np.asarray(np.concatenate([[0.0], sent])[place])
+    newest = np.concatenate([[0.0], np.maximum.accumulate(sent)])
+    return np.asarray(newest[np.searchsorted(arrived, t, side="right")])
