@@ -20,6 +20,8 @@ ONE_THREAD = ("check", "work", "merge")
 """Commands whose last digits must not depend on whether a run is simulated here or in a worker
 process, whose LAPACK has one thread.
 """
+SHORT = "compare", "consistency", "import", "innovations", "new", "report", "schema", "theory"
+"""Commands of one module, ``short``, which has ``run_NAME``."""
 BESIDE = (("tasks", "plan"), ("slurm", "plan"), ("time", "slurm"), ("most", "until"))
 """Options that mean nothing without another one, of commands that have both."""
 WORKERS_PER_CORE = 8  # more processes only fill the memory
@@ -35,16 +37,15 @@ class Option(NamedTuple):
 class Command(NamedTuple):
     """A command: its name, its help, and its options; those in a tuple exclude each other.
 
-    The ``module`` of this package, by default that with its name, has ``_run``, which runs it with
-    the parsed options and returns the exit status. Unless it ``takes_scenario``, there are no
-    scenario file, ``--set`` and ``--trust``.
+    The module of this package with its name has ``_run``, which runs it with the parsed options and
+    returns the exit status; of those in SHORT it is in ``short``. Unless it ``takes_scenario``,
+    there are no scenario file, ``--set`` and ``--trust``.
     """
 
     name: str
     help: str
     options: tuple[Option | tuple[Option, ...], ...]
     takes_scenario: bool = True
-    module: str = ""
 
     def add_to(self, commands: Any) -> None:
         """Add the parser of the command to ``commands``; namespaces have its function ``run``."""
@@ -74,16 +75,18 @@ class Command(NamedTuple):
 
     def _run(self, options: argparse.Namespace) -> int:
         # Only now, so that ``netkf --help`` and usage errors do not wait for numpy and numba.
-        module: Any = import_module(f"netkf.cli.{self.module or self.name.replace('-', '_')}")
+        name = self.name.replace("-", "_")
+        module: Any = import_module(f"netkf.cli.{'short' if name in SHORT else name}")
+        run = getattr(module, f"run_{name}" if name in SHORT else "_run")
         if getattr(options, "plan", None) is not None:
             from netkf.cli.planned import plan_study
 
-            return plan_study(module._run, options)
+            return plan_study(run, options)
         from netkf.cli.progress import ProgressLine
 
         status: int
         with nullcontext() if hasattr(module, "ProgressLine") else ProgressLine():
-            status = module._run(options)
+            status = run(options)
         return status
 
 
@@ -565,7 +568,6 @@ COMMANDS = (
             _trust("the folder of --like"),
         ),
         takes_scenario=False,
-        module="import_log",
     ),
     Command(
         "fit",
