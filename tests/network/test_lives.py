@@ -623,6 +623,19 @@ def write(scenario):
     return path
 
 
+@pytest.mark.parametrize("filter_", ["central", "local"])
+def test_ranges_of_nodes_that_are_down_are_missed_alike_by_both_engines(scenario_of, filter_):
+    scenario = scenario_of(CLOCKS, *recorded(), filter_=filter_)
+    places = [[4.0, 3.0], [-2.0, 1.0], [0.5, -3.0]]
+    sensors = [
+        # Node 1 alone reads at most of these times: whole instants are missed.
+        {"nodes": [1], "sampling": {"kind": "periodic", "period": 0.3}, "positions": places[1:2]},
+        {"nodes": [0, 1, 2], "sampling": {"kind": "periodic", "period": 0.5}, "positions": places},
+    ]
+    ranges = [{"kind": "range", "R": [[0.2]]} | sensor for sensor in sensors]
+    assert_agree(scenario.replace({"sensors": ranges}))
+
+
 @pytest.mark.parametrize("memory", ["kept", "lost"])
 @pytest.mark.parametrize("text", [SLOTS, CLOCKS], ids=["slots", "clocks"])
 def test_the_central_filter_misses_what_nodes_that_are_down_do_not_read(scenario_of, text, memory):

@@ -96,6 +96,9 @@ def silence(instants: Instants, lives: LifeTable, index: dict[int, int]) -> None
     kept = np.logical_or.reduceat(~down, instants.first[:-1])
     instants.t, instants.index = instants.t[kept], instants.index[kept]
     instants.first = np.append(instants.first[:-1][kept], instants.first[-1])
+    if len(instants.nonlinear.sensor):
+        instants.nonlinear.first = instants.first
+        instants.nonlinear.sensor[down] = -1
 
 
 def links_of_lives(
