@@ -15,8 +15,8 @@ from netkf.core.errors import WriteError
 
 RUN = "netkf.figures.pictures", "run_picture"
 ENSEMBLE = "netkf.figures.pictures", "ensemble_picture"
-SWEEP = "netkf.studies.picture", "sweep_picture"
-FILTERS = "netkf.studies.filter_picture", "filter_picture"
+SWEEP = "netkf.studies.pictures", "sweep_picture"
+FILTERS = "netkf.studies.pictures", "filter_picture"
 VERDICT = "netkf.figures.verdict", "verdict_picture"
 REASONS = {SWEEP: "it shows one or two keys", VERDICT: "no row has an interval"}
 """The reason for which a drawing function returns False, which means that it drew nothing."""

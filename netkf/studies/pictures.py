@@ -1,4 +1,4 @@
-"""The picture of a comparison of filters."""
+"""The pictures of a sweep and of a comparison of filters that were just made."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from typing import Any
 
 from netkf.core.printable import shorten
 from netkf.figures.catalogue import plot
+from netkf.figures.figure_data import UnavailableError
+from netkf.figures.stability import sweep_figure
 from netkf.figures.style import (
     BLUE,
     LOG_RATIO,
@@ -18,6 +20,7 @@ from netkf.figures.style import (
 )
 from netkf.scenario.scenario import Scenario
 from netkf.studies.compare_filters import ComparedFilter, CompletedComparison
+from netkf.studies.sweep import CompletedSweep
 
 MAX_LABEL = 34
 PANELS = (
@@ -25,6 +28,17 @@ PANELS = (
     ("worst_instant", "worst instant"),
     ("nees_ratio", "NEES / n"),
 )
+
+
+def sweep_picture(title: str, completed: CompletedSweep) -> bool:
+    """Write ``sweep.png`` and return True; False if more than two keys were varied."""
+    try:
+        with style_context():
+            figure = sweep_figure(title, completed.table, completed.keys, "complete")
+    except UnavailableError:
+        return False
+    write_figure(figure, completed.directory / "sweep.png")
+    return True
 
 
 def filter_picture(scenario: Scenario, completed: CompletedComparison) -> None:
