@@ -4,13 +4,12 @@ Each raises AssertionError with one line (method, rule, the value got, what to d
 if all is well.
 """
 
+from netkf.testing.assertions import assert_dominated, assert_promises, scenario_files
 from netkf.testing.channels import check_channel
 from netkf.testing.clocks import check_clock
 from netkf.testing.filters import check_filter
 from netkf.testing.matchings import check_matching
-from netkf.testing.matrices import assert_dominated
 from netkf.testing.plants import check_plant
-from netkf.testing.scenarios import assert_promises, scenario_files
 from netkf.testing.sensors import check_sensor
 
 __all__ = [

@@ -35,13 +35,15 @@ from netkf.network.losses import (
     has_conditions,
 )
 from netkf.rng.streams import Streams
-from netkf.testing.generators import Calls, RecordingGenerator, describe_calls
 from netkf.testing.noise import demand_agreement, family_level
 from netkf.testing.watching import (
     OTHER_GENERATOR,
+    Calls,
+    RecordingGenerator,
     WatchedPart,
     checker,
     demand_kind,
+    describe_calls,
     guard_user_code,
     is_number,
     make_part,

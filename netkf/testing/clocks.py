@@ -32,10 +32,10 @@ from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import LinkClock
 from netkf.network.graphs import Complete, Link
 from netkf.rng.streams import Streams
-from netkf.testing.generators import RecordingGenerator
 from netkf.testing.noise import demand_agreement, family_level
 from netkf.testing.watching import (
     OTHER_GENERATOR,
+    RecordingGenerator,
     WatchedPart,
     checker,
     demand,

@@ -1,4 +1,6 @@
-"""Calls of methods of users' classes that check for side effects."""
+"""Calls of methods of users' classes that check for side effects, and random generators that record
+their calls.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +21,8 @@ from netkf.core.contracts import ContractError
 from netkf.core.errors import NetkfError, ScenarioError, quote
 from netkf.core.fields import Component, check_values
 from netkf.linalg.arrays import FloatArray
+from netkf.rng.streams import Streams
 from netkf.scenario.plugins import describe_error, describe_failure
-from netkf.testing.generators import RecordingGenerator
 
 Leaves = dict[str, Any]
 """Copies of the numbers, texts and arrays in a value, by their paths such as ``.P[0]``."""
@@ -178,6 +180,41 @@ def global_generator_states() -> tuple[Any, Any]:
 @functools.cache
 def _static_attribute(cls: type, name: str) -> Any:
     return inspect.getattr_static(cls, name, None)
+
+
+Calls = list[tuple[str, int]]
+"""Calls of a generator: method and number of values drawn."""
+
+
+class RecordingGenerator(np.random.Generator):
+    """A random generator that records each call of its methods in ``calls``."""
+
+    def __init__(self, seed: int, *entity: int) -> None:
+        super().__init__(Streams(seed).generator("testing", *entity).bit_generator)
+        self.calls: Calls = []
+
+    def __getattribute__(self, name: str) -> Any:
+        """Return an attribute; calls of methods that draw are appended to ``calls``."""
+        attribute = super().__getattribute__(name)
+        if name.startswith("_") or name in ("calls", "take_calls", "bit_generator"):
+            return attribute
+
+        def draw(*arguments: Any, **keywords: Any) -> Any:
+            values = attribute(*arguments, **keywords)
+            self.calls.append((name, int(np.size(values))))
+            return values
+
+        return draw
+
+    def take_calls(self) -> Calls:
+        """Return the recorded calls and forget them."""
+        calls, self.calls = self.calls, []
+        return calls
+
+
+def describe_calls(calls: Calls) -> str:
+    """Return calls as text, such as "2 x normal", or "nothing"."""
+    return ", ".join(f"{count} x {name}" for name, count in calls) or "nothing"
 
 
 class WatchedPart:
