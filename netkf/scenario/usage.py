@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from netkf.core.repeated_rows import RowUse, count_rows
 from netkf.network.clocks import RecordedClock
 from netkf.network.contacts import Contacts
@@ -105,7 +107,8 @@ def repeat_notes(scenario: DerivedScenario) -> tuple[str, ...]:
     tables: dict[str, tuple[str, str, Sequence[Any]]] = {}
     if isinstance(activation, RecordedClock):
         what = f"{activation.at.removesuffix('s')} and time"
-        tables["network.activation"] = what, activation.path.name, activation.row_keys
+        ticks = _instants(scenario, activation.row_keys)
+        tables["network.activation"] = what, activation.path.name, ticks
     if isinstance(activation, Contacts):
         what = f"{activation.at.removesuffix('s')} and interval"
         tables["network.activation"] = what, activation.path.name, activation.row_keys
@@ -119,7 +122,7 @@ def repeat_notes(scenario: DerivedScenario) -> tuple[str, ...]:
         clock = getattr(sensor, "sampling", None)
         if isinstance(clock, RecordedSampling):
             key = f"{scenario.sensor_key(k)}.sampling"
-            tables[key] = "node and time", clock.path.name, clock.row_times
+            tables[key] = "node and time", clock.path.name, _instants(scenario, clock.row_times)
     positions = scenario.position_table
     if positions is not None:
         what = "node and time" if positions.timed else "node"
@@ -141,6 +144,15 @@ def repeat_notes(scenario: DerivedScenario) -> tuple[str, ...]:
     )
 
 
+def _instants(
+    scenario: DerivedScenario, rows: Sequence[tuple[Any, float]], start: float = 0.0
+) -> list[tuple[Any, float, bool]]:
+    """Return whose each of ``rows`` is, its instant in the run, and if its time is after start."""
+    # A row without any value has no time.
+    times = scenario.time_grid.snap(np.nan_to_num(np.array([t for _, t in rows])))
+    return [(who, at, t > start) for (who, t), at in zip(rows, times.tolist(), strict=True)]
+
+
 def _make_use(use: RowUse) -> Use:
     counts: Use = {
         name: getattr(use, name) for name in ("path", "rows", "used", "merged", "unused")
@@ -152,7 +164,8 @@ def _find_activation_use(scenario: DerivedScenario) -> RowUse | None:
     activation, talks = scenario.network.activation, scenario.filter.algorithm.timing.talks
     if isinstance(activation, RecordedClock):
         end = scenario.horizon if talks else 0.0
-        return count_rows(activation.path.name, activation.row_keys, lambda key: 0.0 < key[1] < end)
+        keys = _instants(scenario, activation.row_keys)
+        return count_rows(activation.path.name, keys, lambda key: key[2] and key[1] < end)
     if isinstance(activation, Contacts):
         end, path = scenario.horizon if talks else 0.0, activation.path.name
         return count_rows(path, activation.row_keys, lambda key: key[1] < end and key[2] > 0.0)
@@ -208,17 +221,17 @@ def _find_row_use(
     # Rows of a sampling that tell a node twice to sample at one time are one sample; readings are
     # told apart by their row.
     is_reading = isinstance(component, ReadingTable)
-    keys = [(node, t, row if is_reading else 0) for row, (node, t) in enumerate(rows)]
     if scenario.slotted:
         slots, period = sensed_slots(scenario), scenario.slot_plant.period
         return count_rows(
             component.path.name,
-            keys,
+            [(node, t, row) for row, (node, t) in enumerate(rows)],
             # A row without any value has no time.
             lambda key: key[0] in nodes and key[1] >= 0.0 and round(key[1] / period) in slots,
         )
     # A sampling clock ticks after time 0 only.
-    start = 0.0 if is_reading else math.ulp(0.0)
+    instants = _instants(scenario, rows, -math.ulp(0.0) if is_reading else 0.0)
+    keys = [(*key, row if is_reading else 0) for row, key in enumerate(instants)]
     return count_rows(
-        component.path.name, keys, lambda key: key[0] in nodes and start <= key[1] < horizon
+        component.path.name, keys, lambda key: key[0] in nodes and key[2] and key[1] < horizon
     )

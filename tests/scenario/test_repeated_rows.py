@@ -34,6 +34,7 @@ SLOTS = {
     },
 }
 RECORDED = {"kind": "recorded", "path": "table.csv"}
+COARSE = {"time": {"resolution": 0.1}}
 GRAPH = {"network.graph": {"kind": "csv", "path": "table.csv"}}
 PLACES = {"network.graph": {"kind": "csv", "path": "links.csv", "positions": "table.csv"}}
 LISTENING = {"network.activation": {"kind": "broadcast"}, "filter": {"kind": "diffusion"}}
@@ -65,6 +66,20 @@ REPEATED = {
         {"network.activation": {**RECORDED, "at": "directions"}},
         "network.activation",
         "t,node,peer\n1,0,1\n1,1,0\n1,0,1\n9,0,1\n",
+        (2, 1, 1),
+    ),
+    "ticks at one instant of the run": (  # 2.96 is 3.0 there, and 3.96 the horizon
+        CLOCKS,
+        {"network.activation": {**RECORDED, "at": "nodes"}, **COARSE},
+        "network.activation",
+        "t,node\n0.96,0\n1.04,0\n1,1\n2.96,0\n3.04,0\n3.96,0\n",
+        (3, 2, 1),
+    ),
+    "sample times at one instant of the run": (
+        CLOCKS,
+        {"sensors.0.sampling": RECORDED, **COARSE},
+        "sensors[0].sampling",
+        "t,node\n0.04,0\n0.96,0\n1.04,0\n3.96,0\n",
         (2, 1, 1),
     ),
     "sample times": (
