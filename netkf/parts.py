@@ -131,8 +131,7 @@ from netkf.plants.relative import (
 )
 from netkf.plants.sampling import RecordedSampling
 from netkf.plants.sensors import LinearSensor, Sensor
-from netkf.scenario.metrics import Metrics
-from netkf.scenario.model import Belief, Filtering, Network
+from netkf.scenario.model import Belief, Filtering, Metrics, Network
 from netkf.scenario.registry import KINDS
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.stamps import Time

@@ -33,6 +33,7 @@ from netkf.core.fields import (
     matrix,
     number,
     one_of,
+    positive,
     seconds,
     source_file,
     square,
@@ -67,7 +68,6 @@ from netkf.scenario.block_sensors import (
     require_no_blocks,
     stacked_sensors,
 )
-from netkf.scenario.metrics import Metrics
 from netkf.scenario.names import bind_names
 from netkf.scenario.plugins import user_components
 from netkf.scenario.positions import placed_nodes, positions_of, table_of_positions
@@ -181,6 +181,26 @@ class Filtering(Component):
     linearise: str = field(one_of(*METHODS), default=METHODS[0])
     estimates: str | tuple[str, ...] = field(_estimates, default="all")
     gate: Gate | None = field(instance_of(Gate), default=None)
+
+
+@dataclass(frozen=True, eq=False)
+class Metrics(Component):
+    """What summaries say beside means over time, of the length of the error |x - xhat|, or the root
+    of trace P where the truth is unknown.
+
+    level      ``time_above`` is the share of samples above it, in units of the state
+    quantiles  orders of the quantiles over the samples
+    network    ages, time connected and the traffic of each node: by default those of single runs,
+               and ages of as many as 100 nodes with 100 sensors; true: of all, and of all runs of
+               ensembles, sweeps and comparisons, which then takes longer; false: none
+    """
+
+    level: float | None = field(positive, default=None)
+    quantiles: tuple[float, ...] = field(
+        list_of(number(low=0.0, high=1.0), "numbers from 0 to 1", min_length=0),
+        default=(0.5, 0.9, 0.99),
+    )
+    network: bool | None = field(boolean, default=None)
 
 
 class PlacedSensor(NamedTuple):

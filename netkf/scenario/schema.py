@@ -31,8 +31,7 @@ from netkf.plants.maps import NonlinearPlant
 from netkf.plants.plant import Plant
 from netkf.plants.sensors import Sensor
 from netkf.scenario.imports import offered_kinds
-from netkf.scenario.metrics import Metrics
-from netkf.scenario.model import Belief, Filtering, Network, ScenarioModel
+from netkf.scenario.model import Belief, Filtering, Metrics, Network, ScenarioModel
 from netkf.scenario.registry import KINDS, list_kinds
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.stamps import Time

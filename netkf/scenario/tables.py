@@ -30,8 +30,7 @@ from netkf.plants.blocks import Block
 from netkf.plants.states import state_file
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.imports import Origin, find_class
-from netkf.scenario.metrics import Metrics
-from netkf.scenario.model import Belief, Filtering, Network
+from netkf.scenario.model import Belief, Filtering, Metrics, Network
 from netkf.scenario.plugins import describe_error, explain_user_error
 from netkf.scenario.registry import KINDS, SLOTTED, find_kind, list_names_of_kind
 from netkf.scenario.stamps import Time
