@@ -70,7 +70,6 @@ from netkf.network.delays import (
     NoDelay,
     UniformDelay,
 )
-from netkf.network.energy import Energy
 from netkf.network.graph_files import EdgelistGraph, GmlGraph, GraphFile, GraphmlGraph
 from netkf.network.graphs import (
     Complete,
@@ -103,7 +102,7 @@ from netkf.network.losses import (
 from netkf.network.matchings import Broadcast, Matching, RecordedSlots, SlotActivation
 from netkf.network.node_clocks import NodeClock
 from netkf.network.quantise import Quantisation
-from netkf.network.radio import Radio
+from netkf.network.radio import Energy, Radio
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.network.scheduled import Hopping, ScheduledLoss
 from netkf.plants.blocks import Block

@@ -1,4 +1,4 @@
-"""The radio of a node: how long it sends a message, and in how many frames."""
+"""The radio of a node: how long it sends a message, in how many frames, and what that costs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from netkf.core.fields import Component, field, integer, one_of, positive
+from netkf.core.fields import Component, field, integer, number, one_of, positive
 from netkf.linalg.arrays import FloatArray
 
 
@@ -38,6 +38,19 @@ class Radio(Component):
     def frames(self, size: float) -> int:
         """Return the number of frames of a message of ``size`` bytes."""
         return 1 if self.frame_bytes is None else max(1, math.ceil(size / self.frame_bytes))
+
+
+@dataclass(frozen=True, eq=False)
+class Energy(Component):
+    """What a node spends on sending; summaries then have ``joules``.
+
+    joules_per_packet  of each transmission, or of each frame of a longer one, see network.radio; a
+                       broadcast is one transmission
+    joules_per_byte    of each byte of it, added to that
+    """
+
+    joules_per_packet: float = field(number(low=0.0), default=0.0)
+    joules_per_byte: float = field(number(low=0.0), default=0.0)
 
 
 class Airtime:

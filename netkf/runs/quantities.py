@@ -10,9 +10,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
-from netkf.network.energy import Energy
 from netkf.network.lives import lifetimes
-from netkf.network.radio import Radio
+from netkf.network.radio import Energy, Radio
 from netkf.rng.streams import Streams
 from netkf.runs.connectivity import ConnectivitySink
 from netkf.runs.transmissions import Transmissions

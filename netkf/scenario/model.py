@@ -46,7 +46,6 @@ from netkf.core.printable import list_some
 from netkf.linalg.arrays import FloatArray, readonly_array
 from netkf.network.channels import Channel
 from netkf.network.clocks import LinkClock
-from netkf.network.energy import Energy
 from netkf.network.graph_files import graph_rule
 from netkf.network.graphs import Graph, Link, RangeGraph, Topology
 from netkf.network.lives import Life
@@ -55,7 +54,7 @@ from netkf.network.matchings import SlotActivation
 from netkf.network.node_clocks import NodeClock
 from netkf.network.positions import Positions, PositionTable
 from netkf.network.quantise import Quantisation
-from netkf.network.radio import Radio
+from netkf.network.radio import Energy, Radio
 from netkf.plants.blocks import Block, Layout, stack
 from netkf.plants.faults import Fault
 from netkf.plants.linear import LinearPlant, SlotPlant

@@ -19,10 +19,9 @@ from netkf.algorithms.registry import default_timing, split_choice
 from netkf.core.fields import Component, Rule
 from netkf.network.channels import Channel
 from netkf.network.contacts import Contacts
-from netkf.network.energy import Energy
 from netkf.network.node_clocks import NodeClock
 from netkf.network.quantise import Quantisation
-from netkf.network.radio import Radio
+from netkf.network.radio import Energy, Radio
 from netkf.network.scheduled import Hopping
 from netkf.plants.blocks import Block
 from netkf.plants.diffusion import Diffusion

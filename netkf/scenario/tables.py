@@ -20,11 +20,10 @@ from netkf.core.contracts import ContractError, is_netkf_class, place_of_error
 from netkf.core.errors import ScenarioError, errors_under, suggest_nearest
 from netkf.core.fields import Component, SourceFile, integer, source_file, walk
 from netkf.network.channels import Channel
-from netkf.network.energy import Energy
 from netkf.network.graph_files import as_graph
 from netkf.network.node_clocks import NodeClock
 from netkf.network.quantise import Quantisation
-from netkf.network.radio import Radio
+from netkf.network.radio import Energy, Radio
 from netkf.network.scheduled import Hopping
 from netkf.plants.blocks import Block
 from netkf.plants.states import state_file
