@@ -167,7 +167,9 @@ def write_figure(figure: Figure, path: Path) -> None:
         if file_format == "png":
             # ``savefig`` would first draw all artists to nowhere.
             canvas: Any = FigureCanvasAgg(figure)
-            canvas.print_png(temporary, metadata=metadata)
+            # A third of the time of level 6, for a file that is one or two percent larger.
+            options = {"compress_level": 2}
+            canvas.print_png(temporary, metadata=metadata, pil_kwargs=options)
         else:
             figure.savefig(temporary, dpi=RESOLUTION, format=file_format, metadata=metadata)
 
