@@ -29,7 +29,7 @@ from netkf.algorithms.rows import Rows, pair_rows, stacked, updated
 from netkf.algorithms.traits import Analysis, Needs, Timing
 from netkf.core.fields import field, integer
 from netkf.core.places import Place
-from netkf.linalg.arrays import FloatArray, symmetric
+from netkf.linalg.arrays import FloatArray, square_root, symmetric
 
 MAX_WINDOW = 1000
 """A message of more states could not be sent: a larger value is a mistake."""
@@ -275,7 +275,9 @@ def evidence_of(state: PathState, message: PathMessage, belief: Path) -> Rows:
             found.append(Rows(z - G_j @ belief.x, np.hstack([G, G_j]), R))
     K = len(state.times) * n
     z, H, R = stacked(found, np.concatenate([known.x[:K], belief.x]))
-    root = np.linalg.cholesky(H[:, K:] @ belief.P @ H[:, K:].T + R)
+    # The root of H P H' + R, without the squares: near each other nodes have large derivatives.
+    roots = np.hstack([H[:, K:] @ square_root(belief.P), np.linalg.cholesky(R)])
+    root = np.linalg.qr(roots.T, mode="r").T
     z, H = (scipy.linalg.solve_triangular(root, part, lower=True) for part in (z, H[:, :K]))
     if len(H) > K:
         # As many readings as states say the same.

@@ -241,37 +241,26 @@ def _judge_node(
     scenario: Scenario, recorded: Innovations, chosen: np.ndarray, law: Law, level: float
 ) -> NodeInnovations:
     """Return the row of the node of ``chosen`` readings, with tests at ``level``."""
-    node = int(recorded.nodes[chosen[0]])
-    nis, rows, is_white = recorded.nis[chosen], recorded.rows[chosen], law.kind == "white"
+    node, is_white = int(recorded.nodes[chosen[0]]), law.kind == "white"
+    nis, rows = recorded.nis[chosen], recorded.rows[chosen]
     freedom, mean = float(rows.sum()), float(nis.sum() / rows.sum())
     whitened = [recorded.whitened[i] for i in chosen]
-    given = [recorded.components[i] for i in chosen] if recorded.components else [None]
-    known = [one for one in given if one is not None]
-    places = known if len(known) == len(chosen) else [np.arange(p) for p in rows]
+    places, are_told = _places(recorded, chosen)
     flat, of = np.concatenate(whitened), np.concatenate(places)
     columns = [flat[of == c] for c in np.unique(of)]
     # Correlated readings count as fewer independent ones.
     inflation = 1.0 if is_white else _inflation(columns)
-    counted = freedom / inflation
-    low, high, detectable = 0.0, math.inf, math.inf
-    if counted > 0.0:
-        low, high = (float(end) for end in chi_square_interval(counted, 1.0 - level))
-        detectable = high / (2.0 * float(gammaincinv(0.5 * counted, 1.0 - POWER)) / counted)
+    low, high, detectable = _limits(freedom / inflation, level)
     bias, reach, found, component = _bias(recorded, chosen, of, inflation, level)
-    label = scenario.label_of_value(node, component, None if places is known else rows)
-    lags = min(LAGS, max(map(len, columns)) // 5)
-    columns = [column for column in columns if len(column) >= MIN_READINGS]
-    statistic = p = correlation = math.nan
-    if columns:
-        statistic, p = whiteness_p(columns, lags, level)
-        correlation = _detectable_correlation(sum(map(len, columns)), lags * len(columns), level)
+    label = scenario.label_of_value(node, component, None if are_told else rows)
+    whiteness = _whiteness(columns, level)
     stretch = find_stretch(nis, rows, np.array([one.sum() for one in whitened]))
     since, until = math.nan, math.nan
     reasons = [reason for reason, holds in (
         (f"NIS above {high:.3g}", bool(law.kind) and mean > high),
         (f"NIS below {low:.3g}", law.kind in ("white", "exact") and mean < low),
         ("biased" + f" in {label}" * bool(label), bool(law.kind) and abs(bias) > reach),
-        ("correlated", is_white and p < level),
+        ("correlated", is_white and whiteness.p < level),
     ) if holds]  # fmt: skip
     if is_white and not reasons and stretch.p < level:
         reasons.append("some readings are not like the others")
@@ -279,12 +268,47 @@ def _judge_node(
         since, until = _ends_of(stretch, recorded.times[chosen])
         ends = (("since", since), ("until", until))
         reasons += [f"{word} {time:g} s" for word, time in ends if math.isfinite(time)]
-    verdict = f"BROKEN: {', '.join(reasons)}" if reasons else _unbroken(law, counted, mean < low)
+    unbroken = _unbroken(law, freedom / inflation, mean < low)
     return NodeInnovations(
-        node, len(chosen), mean, low, high, detectable, bias, reach, found, component, statistic,
-        lags * len(columns), p, correlation, float(recorded.log_density[chosen].sum()),
-        since, until, verdict, label,
+        node, len(chosen), mean, low, high, detectable, bias, reach, found, component, *whiteness,
+        float(recorded.log_density[chosen].sum()), since, until,
+        f"BROKEN: {', '.join(reasons)}" if reasons else unbroken, label,
     )  # fmt: skip
+
+
+def _places(recorded: Innovations, chosen: np.ndarray) -> tuple[list[np.ndarray], bool]:
+    """Return which value each of ``chosen`` readings is of, and True if the record tells it."""
+    told = [recorded.components[i] for i in chosen] if recorded.components else [None]
+    known = [one for one in told if one is not None]
+    if len(known) == len(chosen):
+        return known, True
+    return [np.arange(p) for p in recorded.rows[chosen]], False
+
+
+def _limits(counted: float, level: float) -> tuple[float, float, float]:
+    """Return the limits of a mean of so many squares, and the variance that POWER finds."""
+    if not counted > 0.0:
+        return 0.0, math.inf, math.inf
+    low, high = (float(end) for end in chi_square_interval(counted, 1.0 - level))
+    return low, high, high / (2.0 * float(gammaincinv(0.5 * counted, 1.0 - POWER)) / counted)
+
+
+class _Whiteness(NamedTuple):
+    statistic: float
+    freedom: int
+    p: float
+    correlation: float
+
+
+def _whiteness(columns: list[FloatArray], level: float) -> _Whiteness:
+    """Return the test of Ljung and Box, and the correlation that POWER finds."""
+    lags = min(LAGS, max(map(len, columns)) // 5)
+    columns = [column for column in columns if len(column) >= MIN_READINGS]
+    if not columns:
+        return _Whiteness(math.nan, 0, math.nan, math.nan)
+    correlation = _detectable_correlation(sum(map(len, columns)), lags * len(columns), level)
+    statistic, p = whiteness_p(columns, lags, level)
+    return _Whiteness(statistic, lags * len(columns), p, correlation)
 
 
 def _ends_of(stretch: Stretch, times: FloatArray) -> tuple[float, float]:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import netkf
+from netkf.scenario.reading import from_table
 from netkf.trace.schema import KINDS
 from tests.algorithms.test_block_intersection import BELIEF, CLOCKED, ROBOTS, load
 
@@ -162,3 +163,28 @@ def test_loops_are_noted(tmp_path: Path) -> None:
     noted = load(ROBOTS, tmp_path, network__graph=graph, **belief).notes
     assert any("loops" in note and "P is too small" in note for note in noted)
     assert not any("loops" in note for note in load(ROBOTS, tmp_path, **belief).notes)
+
+
+def test_bearings_of_nodes_that_are_nearly_at_one_place(tmp_path: Path) -> None:
+    """Their derivatives are so large that squares of them leave nothing of R."""
+    table = {
+        "format": 1, "name": "one place", "horizon": 6.0, "probe": 0.5, "seed": 3,
+        "plants": [{
+            "name": "pose", "nodes": [1, 2, 3], "kind": "nonlinear", "f": "unicycle", "step": 0.05,
+            "B": np.diag([0.1, 0.1, 0.03]).tolist(), "cov": np.diag([0.3, 0.3, 0.02]).tolist(),
+            "means": [[0.0, 0.0, 0.3], [1e-9, 1e-9, 0.3], [2e-9, 0.0, 0.3]],
+            "input": {"kind": "constant", "value": [0.0, 0.5]},
+        }],
+        "sensors": [{
+            "kind": "relative-bearing", "of": "pose", "R": [[0.05]],
+            "sampling": {"kind": "periodic", "period": 0.5, "phase": 1e-6},
+        }],
+        "network": {
+            "graph": {"kind": "edges", "edges": [[1, 2], [2, 3]]},
+            "activation": {"kind": "poisson", "rate": 4.0},
+        },
+        "filter": BELIEF | {"estimates": "own"},
+    }  # fmt: skip
+    run = netkf.simulate(from_table(table, tmp_path))
+    assert run.status == "complete"
+    assert np.linalg.eigvalsh(run.P).min() > -1e-12
