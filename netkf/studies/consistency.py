@@ -362,7 +362,8 @@ def consistency(
     Raises ScenarioError for bad arguments and if there is no block to judge.
     """
     require_scenario(scenario, "consistency")
-    if len(blocks_without_law(scenario)) == len(scenario.layout.places):
+    has_law = len(blocks_without_law(scenario)) < len(scenario.layout.places)
+    if not (has_law and judged_blocks(scenario)):
         rule = "states or readings are recorded, so the law of the errors is unknown"
         remedy = (
             "simulate the plant and all readings, or use netkf innovations, which needs no truth"

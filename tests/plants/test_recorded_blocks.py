@@ -295,8 +295,14 @@ def test_blocks_that_are_drawn_are_judged_and_others_named(tmp_path, slots):
     recorded = {"plants": [{**plant, "kind": "unknown"} for plant in table["plants"]]}
     recorded["plants"][1].pop("path")
     recorded["sensors"] = [table["sensors"][2]]
-    with pytest.raises(ScenarioError, match="law of the errors is unknown"):
-        netkf.consistency(alone.replace(recorded), runs=10, workers=1)
+    # A block with a law that no node estimates does not help.
+    shared = {
+        key: table["plants"][0][key] for key in ({"F", "Q", "period"} if slots else {"A", "B"})
+    }
+    beside = {**recorded, "plants": [*recorded["plants"], {**shared, "name": "shared"}]}
+    for changes in (recorded, beside):
+        with pytest.raises(ScenarioError, match="law of the errors is unknown"):
+            netkf.consistency(alone.replace(changes), runs=10, workers=1)
 
 
 SEEN = """t,node,to,y0,R0
