@@ -12,6 +12,7 @@ from netkf.scenario.reading import from_table
 from netkf.scenario.writing import as_table
 from tests.conftest import SCENARIOS
 
+ENGINES = "simpy", "compiled"
 PLANTS = {
     "slots": {"kind": "linear", "F": [[0.95]], "Q": [[0.3]], "period": 1.0, "cov": [[1.0]]},
     "clocks": {"kind": "diffusion", "A": [[-0.1]], "B": [[0.5]], "cov": [[1.0]]},
@@ -46,6 +47,18 @@ def test_filters_do_not_see_them_and_errors_are_as_large_as_they_say(tmp_path, t
         assert row["nis"] == pytest.approx(1.0, abs=0.45)
         assert row["noise"] == pytest.approx(0.4)
         assert row["without_noise"] == row["mean_square"] - row["noise"]
+
+
+@pytest.mark.parametrize("time", ["slots", "clocks"])
+def test_where_all_are_held_out_many_runs_are_as_single_ones(tmp_path, time):
+    activation = {"kind": "broadcast" if time == "slots" else "readings"}
+    network = {"graph": {"kind": "path", "nodes": 3}, "activation": activation}
+    changes = {"network": network, "filter": {"kind": "diffusion"}, "horizon": 8.0, "probe": 2.0}
+    given = scenario(tmp_path, time, **changes)
+    alone = given.replace({"sensors": as_table(given)["sensors"][:1]})
+    simpy, compiled = (netkf.monte_carlo(alone, 3, workers=1, engine=e) for e in ENGINES)
+    assert compiled.fingerprint == simpy.fingerprint
+    np.testing.assert_allclose(compiled.mean_P, simpy.mean_P, rtol=1e-10)
 
 
 def test_other_draws_stay_as_they_are(tmp_path):

@@ -187,11 +187,12 @@ def drawn_together(scenario: Scenario) -> bool:
         return False
     if scenario.network.lives or scenario.network.clocks or scenario.network.quantise:
         return False
+    if senders_of(scenario).at == "readings":
+        return False
     if not scenario.sampled_sensors:
         return uses_grid(scenario)
     is_free = scenario.plant.is_random and scenario.plant.linear and not uses_grid(scenario)
-    at_readings = senders_of(scenario).at == "readings" or scenario.input_responses is not None
-    return is_free and not at_readings and kernel_sensors(scenario) is not None
+    return is_free and scenario.input_responses is None and kernel_sensors(scenario) is not None
 
 
 @once_per_scenario
