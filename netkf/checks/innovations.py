@@ -100,6 +100,12 @@ class TimedState(NamedTuple):
     time: float
     start: tuple[FloatArray, FloatArray | None]
 
+    @property
+    def root(self) -> FloatArray:
+        """The root of P that the filter has, on which its sigma points lie."""
+        root: FloatArray = self.inner.root
+        return root
+
 
 class ExpectedIncrements:
     """Predictions of increments under one ``model`` with A, Q, H and R, over any interval."""

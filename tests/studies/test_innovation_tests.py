@@ -24,6 +24,7 @@ from netkf.studies.innovation_tests import (
 )
 from netkf.studies.tables import format_consistency
 from tests.conftest import SCENARIOS
+from tests.plants.test_faults import CURVED
 
 WALK = {
     "format": 1,
@@ -358,3 +359,16 @@ def test_a_node_with_too_few_readings_does_not_hide_what_others_would_show(tmp_p
         assert "not judged: too few" in shown
         assert "inf" not in shown
         assert shown.splitlines()[-1].startswith(last)
+
+
+@pytest.mark.parametrize(("kind", "linearise"), [("icf", "ukf"), ("diffusion", "ckf")])
+def test_a_replay_has_the_sigma_points_of_the_run(tmp_path, kind, linearise):
+    """Nodes that start at one place: the sign of a rounding error decides on a direction."""
+    text = CURVED.format(fault="", filter=kind, estimates="all").replace("lives", "# lives")
+    text = text.replace("relative-range", "relative-range-bearing").replace("path", "complete")
+    text = text.replace("R = [[0.2]]", "R = [[0.2, 0.0], [0.0, 0.05]]").replace("= 2 }", "= 4 }")
+    path = tmp_path / "one_place.toml"
+    path.write_text(text.replace("nodes = [0, 1]\nperiod", "nodes = [0, 1, 2, 3]\nperiod"))
+    changes = {"filter.linearise": linearise, "filter.gate": {"probability": 0.9}, "seed": 1}
+    run = netkf.simulate(netkf.load(path).replace(changes), engine="simpy")
+    assert [row.node for row in netkf.innovations(run).rows] == [0, 1, 2, 3]
