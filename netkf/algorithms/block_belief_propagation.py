@@ -277,7 +277,7 @@ def evidence_of(state: PathState, message: PathMessage, belief: Path) -> Rows:
     z, H, R = stacked(found, np.concatenate([known.x[:K], belief.x]))
     # The root of H P H' + R, without the squares: near each other nodes have large derivatives.
     roots = np.hstack([H[:, K:] @ square_root(belief.P), np.linalg.cholesky(R)])
-    root = np.linalg.qr(roots.T, mode="r").T
+    root = np.asarray(np.linalg.qr(roots.T, mode="r")).T
     z, H = (scipy.linalg.solve_triangular(root, part, lower=True) for part in (z, H[:, :K]))
     if len(H) > K:
         # As many readings as states say the same.
