@@ -167,7 +167,7 @@ def write_figure(figure: Figure, path: Path) -> None:
         if file_format == "png":
             # ``savefig`` would first draw all artists to nowhere.
             canvas: Any = FigureCanvasAgg(figure)
-            # A third of the time of level 6, for a file that is one or two percent larger.
+            # Level 6 takes longer, for a file that is one or two percent smaller.
             options = {"compress_level": 2}
             canvas.print_png(temporary, metadata=metadata, pil_kwargs=options)
         else:

@@ -118,15 +118,14 @@ def _rough_inverse(linear: LinearisedRiccati) -> Rows:
     """
     packed, n = linear.packed, linear.drifts.shape[1]
     if n <= MAX_PACKED:
-        shared, inverse = linear.shared_map, np.linalg.inv(linear.blocks)
+        shared, inverse = linear.shared_map(), np.linalg.inv(linear.blocks)
         coarse = np.linalg.inv(shared.mean(axis=0))
         # What is left of a shared row c after each node alone: c - (c L) L_i^-1.
         rest = np.eye(packed.m) - shared @ inverse
-        rest = np.moveaxis(rest, 1, 0).reshape(packed.m, -1)
 
         def solve(X: FloatArray) -> FloatArray:
-            alone = np.einsum("ik,ikl->il", X, inverse)
-            return np.asarray(alone + (X.mean(axis=0) @ coarse @ rest).reshape(X.shape))
+            alone, common = np.einsum("ik,ikl->il", X, inverse), X.mean(axis=0) @ coarse
+            return np.asarray(alone + np.einsum("k,ikl->il", common, rest))
 
         return solve
     # m^3 operations are too many: Lyapunov equations take n^3. They leave out what samples add to

@@ -259,9 +259,8 @@ class LinearisedRiccati:
         """Return what rows X (N, m) change per second, (N, m)."""
         return np.asarray(self.remaining(X) + self.arriving(X))
 
-    @cached_property
     def shared_map(self) -> FloatArray:
-        """The map (N, m, m) of a row that all nodes share."""
+        """Return the map (N, m, m) of a row that all nodes share."""
         total = self.blocks.copy()
         for rates, _, maps in self.heard:
             if len(maps) == 1:
