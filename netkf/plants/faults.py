@@ -155,7 +155,8 @@ class FaultyReadings:
         """Return what a fault does not change: matrices, and noises that readings bring."""
         return getattr(self.__dict__["_path"], name)
 
-    def _given(self, k: int, y: FloatArray) -> FloatArray:
+    def given(self, k: int, y: FloatArray) -> FloatArray:
+        """Return what the sensor gives in place of its healthy reading number ``k``, y (p,)."""
         time = self._when(k)
         return np.asarray(self._give(time, y)) if self._fault.holds(time) else y
 
@@ -163,11 +164,11 @@ class FaultyReadings:
         """Return the reading number ``k``, see ``Readings`` and ``Samples``."""
         healthy = self._path.reading(k, x)
         if isinstance(healthy, tuple):
-            return self._given(k, healthy[0]), healthy[1]
-        return self._given(k, healthy)
+            return self.given(k, healthy[0]), healthy[1]
+        return self.given(k, healthy)
 
     def several(self, numbers: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return readings (S, p) and H (S, p, n) of increasing ``numbers`` with x (S, n)."""
         y, H = read_many(self._path, numbers, x)
-        given = [self._given(k, one) for k, one in zip(numbers, y, strict=True)]
+        given = [self.given(k, one) for k, one in zip(numbers, y, strict=True)]
         return np.array(given).reshape(y.shape), H

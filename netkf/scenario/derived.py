@@ -711,7 +711,7 @@ class DerivedScenario(ScenarioModel):
         if believed is None and sensor.fault is None:
             return path
         times = times_of_sensor(self, streams, node, placed_sensor)
-        path = self._given(path, streams, node, placed_sensor, times.tolist().__getitem__)
+        path = self.given_readings(path, streams, node, placed_sensor, times.tolist().__getitem__)
         return path if believed is None else MovedReadings(path, believed, times)
 
     def slot_path(self, streams: Streams, node: int, placed_sensor: PlacedSensor) -> Readings:
@@ -721,11 +721,11 @@ class DerivedScenario(ScenarioModel):
         path: Readings = sensor.slot_path(
             node, period, lambda purpose: streams.generator(purpose, node, placed_sensor.ordinal)
         )
-        path = self._given(path, streams, node, placed_sensor, self.slot_plant.slot_time)
+        path = self.given_readings(path, streams, node, placed_sensor, self.slot_plant.slot_time)
         believed = self._moves_readings(sensor)
         return path if believed is None else MovedReadings(path, believed)
 
-    def _given(
+    def given_readings(
         self,
         path: Any,
         streams: Streams,

@@ -62,7 +62,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import LANES, MANY, aligned, blocks_of, by_run, in_lanes, unset
 from netkf.linalg.portable import cholesky, solve_lower
 from netkf.network.deliveries import Deliveries
-from netkf.plants.faults import Course, Fault
+from netkf.plants.faults import FaultyReadings
 from netkf.plants.maps import NonlinearPlant
 from netkf.plants.slot_paths import (
     MapPaths,
@@ -217,14 +217,13 @@ class SlotRuns:
             (s, [scenario.slot_path(r, s.node, s.placed_sensor) for r in streams.per_replica])
             for s in setup.own_sensors
         ]
-        # What is not linear is read by kernels: what a bad sensor gives instead, for each run.
-        faults = [(s, scenario.fault_of(s.node, s.placed_sensor)) for s in setup.nonlinear_sensors]
-        self._bad: list[tuple[AssignedSensor, Fault, list[Course]]] = []
-        for s, fault in faults:
-            if fault is not None:
-                entity = "fault", s.node, s.placed_sensor.ordinal
-                given = [fault.begin(one.generator(*entity)) for one in streams.per_replica]
-                self._bad.append((s, fault, given))
+        # What is not linear is read by kernels: what a bad sensor gives instead, in each run.
+        when, many = scenario.slot_plant.slot_time, streams.per_replica
+        self._bad: list[tuple[AssignedSensor, list[FaultyReadings]]] = [
+            (s, [scenario.given_readings(None, r, s.node, s.placed_sensor, when) for r in many])
+            for s in setup.nonlinear_sensors
+            if scenario.fault_of(s.node, s.placed_sensor) is not None
+        ]
 
     def _begin_messages(self) -> None:
         setup, streams = self.setup, self._streams
@@ -628,13 +627,13 @@ class SlotRuns:
 
     def _give_bad_readings(self, times: SlotTimes, y: FloatArray) -> None:
         """Write what sensors that are bad, and not linear, give in place of their readings."""
-        sensed = np.flatnonzero(times.sensed).tolist() if self._bad else []
-        for k, time in [(k, self._scenario.slot_plant.slot_time(self._slot + k)) for k in sensed]:
-            for s, fault, given in self._bad:
+        for k in np.flatnonzero(times.sensed).tolist() if self._bad else ():
+            for s, given in self._bad:
                 readings = y[:, k, s.estimator, s.row : s.row + s.rows]
-                for run, give in enumerate(given if fault.holds(time) else ()):
+                for run, bad in enumerate(given):
                     b, lane = divmod(run, LANES)
-                    readings[b, :, lane] = give(time, readings[b, :, lane].copy())
+                    healthy = readings[b, :, lane].copy()
+                    readings[b, :, lane] = bad.given(self._slot + k, healthy)
 
     def _silence(self, y: FloatArray, H: FloatArray) -> None:
         """Take away the readings of nodes that are down."""
