@@ -13,6 +13,7 @@ import pandas as pd
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import as_path
 from netkf.logs.importing import write_files
+from netkf.logs.packet_tables import EXPORTED
 from netkf.logs.recorded_network import Files
 from netkf.network.clocks import LinkClock
 from netkf.network.lives import lifetimes
@@ -172,7 +173,7 @@ def export_log(run: Run, out: str | Path) -> tuple[Path, ...]:
             ],
         }
     )
-    source = f"# netkf: seed {run.seed}, replica {run.replica}, engine {run.engine}\n"
+    source = f"{EXPORTED}seed {run.seed}, replica {run.replica}, engine {run.engine}\n"
     files: Files = {"packets.csv": source + table.to_csv(index=False)}
     activation = scenario.network.activation
     right = not scenario.network.clocks

@@ -65,6 +65,7 @@ UNKNOWN = ("", "nan", "na", "none", "unknown", "?", "-1")
 MAX_CYCLE = 64  # channels over which packets of a sender hop in turn
 NO_STAMP = ("", "nan", "na", "nat", "none", "null", "-1", *LOST)  # of t_heard
 EXTRAS = ("positions", "readings")
+EXPORTED = "# netkf: "  # the log of a run begins so
 
 
 class _Rows(NamedTuple):
@@ -105,7 +106,9 @@ def read_tables(log: Path, columns: Mapping[str, str]) -> PacketLog:
         where = table["where"].iloc[early[0]]
         rule = f"{where}: is heard before it is sent"
         raise ScenarioError(str(log), rule, None, "correct the stamps; lost packets have none")
-    sends, outcomes = _match(table, resolution, notes, str(log))
+    # All messages of an exported run are there: a link that is down has none.
+    is_export = is_run and _is_export(log / "packets.csv")
+    sends, outcomes = _match(table, resolution, notes, str(log), is_export)
     if not is_run and (first := float(sends["t"].min())) <= 0.0:  # clocks were aligned
         sends["t"] += 1.0 - first // 1.0
         origin -= Decimal(int(1.0 - first // 1.0))
@@ -113,12 +116,20 @@ def read_tables(log: Path, columns: Mapping[str, str]) -> PacketLog:
     if is_run and (log / "ticks.csv").is_file():
         result.ticks = log / "ticks.csv"
     if (table["what"] == "outcome").all() and (table["heard"] == 0.0).any():
-        result.absent = "unknown"  # the log says itself what was lost
+        # The log says itself what was lost.
+        result.absent = "unsent" if is_export else "unknown"
     if extras["positions"] is not None:
         result.positions = read_positions(extras["positions"], origin, notes)
     if extras["readings"] is not None:
         result.readings = read_readings(extras["readings"], origin, notes)
     return result
+
+
+def _is_export(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(EXPORTED)) == EXPORTED.encode()
 
 
 def _packet_paths(log: Path) -> list[Path]:
@@ -294,14 +305,14 @@ def _join(parts: list[_Rows]) -> _Rows:
 
 
 def _match(
-    table: pd.DataFrame, resolution: float, notes: list[str], log: str
+    table: pd.DataFrame, resolution: float, notes: list[str], log: str, is_export: bool
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return transmissions and outcomes: rows that speak of one transmission are joined."""
     table["to"] = ""
     if _counts_directions(table):
         table["to"] = table["receiver"]
         notes.append("used: each row is a message of its own to one receiver, no broadcast")
-    table["key"] = _number_transmissions(table, notes, log)
+    table["key"] = _by_stamps(table) if is_export else _number_transmissions(table, notes, log)
     # Of one transmission the sender's own stamp counts, else the first one.
     table["order"] = (table["what"] != "tx").astype(int)
     ordered = table.sort_values(["order", "t"], kind="stable")
@@ -342,7 +353,7 @@ def _number_transmissions(table: pd.DataFrame, notes: list[str], log: str) -> pd
     keys = pd.Series(index=table.index, dtype=object)
     table["counter"] = 0
     wraps = restarts = missing = 0
-    moduli, intervals = set(), []
+    moduli, intervals, wrong = set(), [], ""
     _align_clocks(table, notes)
     for (sender, to), rows in table.groupby(["sender", "to"], sort=True):
         own = rows.sort_values(["t", "number"], kind="stable")
@@ -350,11 +361,9 @@ def _number_transmissions(table: pd.DataFrame, notes: list[str], log: str) -> pd
         missing += len(own) - len(known)
         found = unwrap(known["number"].to_numpy().astype(np.int64), known["t"].to_numpy())
         if found[3] > max(3, len(np.unique(found[0])) // 10):
-            rule = f"numbers of {sender} begin again {found[3]} times: stamps do not fit each other"
-            remedy = (
-                "correct those of clocks that began again, or that are a cycle of numbers apart"
+            wrong = wrong or (
+                f"numbers of {sender} begin again {found[3]} times: stamps do not fit each other"
             )
-            raise ScenarioError(log, rule, None, remedy)
         wraps, restarts = wraps + found[1], restarts + found[3]
         moduli |= {found[2]} if found[1] else set()
         table.loc[known.index, "counter"] = found[0]
@@ -366,10 +375,10 @@ def _number_transmissions(table: pd.DataFrame, notes: list[str], log: str) -> pd
     spread = (times.max() - times.min()).quantile(0.9)
     if (table["what"] == "outcome").all() and intervals and spread > np.median(intervals):
         notes.append("used: numbers count the messages of each pair; equal stamps are one packet")
-        again = table.groupby(["sender", "t", "receiver"]).cumcount()
-        table["counter"] = again
-        told = zip(table["sender"], table["t"].tolist(), again.tolist(), strict=True)
-        return pd.Series([_key(i, t, k) for i, t, k in told], index=table.index)
+        return _by_stamps(table)
+    if wrong:
+        remedy = "correct those of clocks that began again, or that are a cycle of numbers apart"
+        raise ScenarioError(log, wrong, None, remedy)
     if wraps:
         lengths = " or ".join(map(str, sorted(moduli)))
         notes.append(f"used: numbers wrap after {lengths}: {count_phrase(wraps, 'time')}")
@@ -378,6 +387,14 @@ def _number_transmissions(table: pd.DataFrame, notes: list[str], log: str) -> pd
     text = "used: {} without a number: equal stamps of a sender are one packet"
     note_count(notes, missing, "row", text)
     return keys
+
+
+def _by_stamps(table: pd.DataFrame) -> pd.Series:
+    """Return the key where messages of one sender and stamp are one transmission."""
+    again = table.groupby(["sender", "t", "receiver"]).cumcount()
+    table["counter"] = again
+    told = zip(table["sender"], table["t"].tolist(), again.tolist(), strict=True)
+    return pd.Series([_key(i, t, k) for i, t, k in told], index=table.index)
 
 
 def _align_clocks(table: pd.DataFrame, notes: list[str]) -> None:

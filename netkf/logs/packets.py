@@ -56,7 +56,7 @@ class PacketLog:
                empty for a broadcast), sent (False: inferred, not reported), logged (by the sender
                itself); in the order of t
     outcomes : send (row of ``sends``), receiver, heard (1, 0, nan for unknown), delay (s), rssi
-    absent   : what a transmission without a row at a hearer is: "lost" or "unknown"
+    absent   : what a transmission without a row at a hearer is: "lost", "unknown", or "unsent"
     resolution : seconds of the last digit of stamps
     positions : node, x, y, and readings: t, node, y0; empty if there are none
     is_run   : times are simulated, those of a run, whose clocks have the table ``ticks``
@@ -301,6 +301,8 @@ def settle(log: PacketLog, hole: float, unreported: str) -> pd.DataFrame:
     whole = base.merge(pairs, on="sender")
     whole = whole[(whole["to"] == "") | (whole["to"] == whole["receiver"])]
     whole = whole.merge(told.assign(told=True), on=["send", "receiver"], how="left")
+    if log.absent == "unsent":
+        whole = whole[whole["told"].notna()].reset_index(drop=True)
     missing, send = whole["told"].isna().to_numpy(), whole["send"].to_numpy()
     why = np.where(whole["heard"].isna(), TOLD, "").astype(object)
     if log.absent == "lost":

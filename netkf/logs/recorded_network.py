@@ -205,19 +205,16 @@ def _own_scenario(
     sends, nodes = log.sends, sorted({*account["sender"], *account["receiver"]})
     ids: list[Any] = [int(node) for node in nodes] if _is_number(nodes[0]) else nodes
     ids = sorted(ids)
-    silent = set(sends["sender"]) - set(nodes)
-    if silent:
-        log.notes.append(
-            f"dropped: {count_phrase(int(sends['sender'].isin(silent).sum()), 'transmission')} of "
-            f"nodes that nobody ever heard: {', '.join(sorted(silent))}"
-        )
-        sends = sends[~sends["sender"].isin(silent)]
+    sends = _sends_of(log, set(nodes), "that nobody ever heard")
     directed = bool((sends["to"] != "").any())
     ticks = sends[["t", "sender", "to"]].set_axis(["t", "node", "peer"], axis=1)
     ticks = ticks if directed else ticks[["t", "node"]]
     files: Files = {"transmissions.csv": ticks.to_csv(index=False)}
     rate = len(sends) / sends["sender"].nunique() / max(float(sends["t"].max()), 1e-9)
-    last = max(float(sends["t"].max()), float(log.readings["t"].max()) if len(log.readings) else 0)
+    arrivals = log.sends["t"].to_numpy()[log.outcomes["send"]] + log.outcomes["delay"]
+    times = [sends["t"], arrivals[np.isfinite(arrivals)]]
+    times += [log.readings["t"]] if len(log.readings) else []
+    last = float(pd.concat(times).max())
     horizon = float(math.floor(last) + 1)
     keys: dict[str, Any] = {"log": name, "name": name, "horizon": horizon}
     keys["probe"] = _round_number(horizon / 200.0)
@@ -245,6 +242,15 @@ def _own_scenario(
             log.notes.append(f"dropped: positions, of {found} of {len(nodes)} nodes only")
     files["scenario.toml"] = HEAD.format(**keys, told=told) + plant + network + FILTER
     return files
+
+
+def _sends_of(log: PacketLog, nodes: set[str], which: str) -> pd.DataFrame:
+    """Return the transmissions of ``nodes``, those of others, ``which``, being noted."""
+    silent = ~log.sends["sender"].isin(nodes)
+    names = ", ".join(sorted(set(log.sends["sender"][silent])))
+    text = "dropped: {} of nodes " + f"{which}: {names}"
+    note_count(log.notes, silent.sum(), "transmission", text)
+    return log.sends[~silent].copy()
 
 
 def _of_network(log: PacketLog, table: pd.DataFrame, nodes: list[str], what: str) -> pd.DataFrame:
@@ -349,25 +355,63 @@ def _recorded_activation(
     scenario: Scenario, log: PacketLog
 ) -> tuple[dict[str, Any], str | Path] | None:
     """Return the table network.activation that sends as in the log, and its file, if needed."""
-    activation, sends = scenario.network.activation, log.sends
-    table: dict[str, Any] = {"kind": "recorded", "path": "transmissions.csv"}
-    if isinstance(activation, Matching):
-        slots = np.floor(sends["t"] / scenario.slot_plant.period + 1e-9).astype(int)
-        ids = {str(node): int(node) for node in scenario.nodes}
-        by_column = [[ids[name] for name in sends[column]] for column in ("sender", "to")]
-        pairs = np.sort(by_column, axis=0).T
-        rows = pd.DataFrame({"slot": slots, "node": pairs[:, 0], "peer": pairs[:, 1]})
-        table |= {} if activation.phase is None else {"phase": activation.phase}
-        return table, rows.drop_duplicates().to_csv(index=False)
-    if not isinstance(activation, LinkClock) or isinstance(activation, OnReadings):
+    activation = scenario.network.activation
+    pairing = activation if isinstance(activation, Matching) else None
+    if isinstance(activation, OnReadings) or not isinstance(activation, Matching | LinkClock):
         return None
     if log.is_run and scenario.network.clocks:
         return None  # It ticks again by the clocks of its nodes.
-    at, is_broadcast = activation.at, bool((sends["to"] == "").any())
-    if log.ticks is None and is_broadcast != (at == "nodes"):
-        at = "nodes" if is_broadcast else "directions"
-        log.notes.append(f'used: clocks at = "{at}", by what the log says of packets')
-    return {**table, "at": at}, log.ticks or _clock_rows(sends, at, scenario.time.stamps)
+    table: dict[str, Any] = {"kind": "recorded", "path": "transmissions.csv"}
+    at = activation.at if isinstance(activation, LinkClock) else "links"
+    if log.ticks is not None:
+        return {**table, "at": at}, log.ticks
+    sends = _sends_of(log, {str(node) for node in scenario.nodes}, "that the scenario has not")
+    if at != "nodes":
+        _name_only_receivers(sends, log)
+    needed = "nodes" if (sends["to"] == "").any() else "directions" if at == "nodes" else at
+    if needed not in (("links",) if pairing else scenario.node_filter.timing.clocks):
+        told = "broadcasts" if needed == "nodes" else "messages to one receiver"
+        rule = (
+            f"must be one under which nodes send {told}, as in the log, and the filter knows none"
+        )
+        raise ScenarioError("network.activation", rule, at, "choose another filter")
+    if needed != at:
+        log.notes.append(f'used: clocks at = "{needed}", by what the log says of packets')
+    if pairing:
+        sends["t"] = np.floor(sends["t"] / scenario.slot_plant.period + 1e-9).astype(int)
+    if needed == "links":
+        _note_pairs(sends, log.notes, "slot" if pairing else "stamp")
+    if not pairing:
+        return {**table, "at": needed}, _clock_rows(sends, needed, scenario.time.stamps)
+    ids = {str(node): int(node) for node in scenario.nodes}
+    rows = _pairs(sends.replace({"sender": ids, "to": ids})).rename(columns={"t": "slot"})
+    table |= {} if pairing.phase is None else {"phase": pairing.phase}
+    return table, rows.drop_duplicates().to_csv(index=False)
+
+
+def _name_only_receivers(sends: pd.DataFrame, log: PacketLog) -> None:
+    """Name the receiver of broadcasts of senders that have one hearer each, if all have."""
+    pairs = pd.DataFrame({"to": log.outcomes["receiver"]})
+    pairs["sender"] = log.sends["sender"].to_numpy()[log.outcomes["send"]]
+    only = pairs.drop_duplicates().set_index("sender")["to"]
+    if only.index.is_unique and sends["sender"].isin(only.index).all():
+        sends["to"] = sends["to"].mask(sends["to"] == "", sends["sender"].map(only))
+
+
+def _note_pairs(sends: pd.DataFrame, notes: list[str], what: str) -> None:
+    """Note where what links send, both ways at once, is not what the log says."""
+    apart = sends[["t", "sender", "to"]].drop_duplicates()
+    more = 2 * len(_pairs(apart).drop_duplicates()) - len(apart)
+    text = "sent beside the log: {} the other way, as links exchange; message k of a direction has"
+    note_count(notes, more, "message", f"{text} the fate of its message k in the log")
+    text = "merged: {} with another one of its direction and " + what
+    note_count(notes, len(sends) - len(apart), "message", text)
+
+
+def _pairs(sends: pd.DataFrame) -> pd.DataFrame:
+    """Return the columns t, node, peer, the lower of which comes first."""
+    ends = np.sort(sends[["sender", "to"]].to_numpy(), axis=1)
+    return pd.DataFrame({"t": sends["t"].to_numpy(), "node": ends[:, 0], "peer": ends[:, 1]})
 
 
 def _clock_rows(sends: pd.DataFrame, at: str, stamps: TimeBase) -> str:
@@ -377,6 +421,5 @@ def _clock_rows(sends: pd.DataFrame, at: str, stamps: TimeBase) -> str:
     if at == "nodes":
         rows = rows[["t", "node"]]
     if at == "links":
-        pair = np.sort(rows[["node", "peer"]].to_numpy(), axis=1)
-        rows["node"], rows["peer"] = pair[:, 0], pair[:, 1]
+        rows = _pairs(sends)
     return rows.drop_duplicates().to_csv(index=False)

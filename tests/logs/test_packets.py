@@ -467,6 +467,108 @@ def test_a_log_counts_a_cause_once(cause, tmp_path):
     np.testing.assert_array_equal(run.xhat, replay.xhat)
 
 
+SOME_LINKS = {
+    "contacts": {"kind": "contacts", "path": "contacts.csv", "at": "links"},
+    "links": {"kind": "periodic", "period": 0.5, "at": "links"},
+    "nodes": {"kind": "periodic", "period": 0.5, "at": "nodes"},
+    "readings": {"kind": "readings"},
+    "slots": {"kind": "broadcast"},
+}
+
+
+@pytest.mark.parametrize("name", SOME_LINKS)
+def test_of_a_run_nothing_is_taken_to_be_sent_over_a_link_that_is_down(name, tmp_path):
+    """Nodes send at one instant, now to these and now to those: numbers of directions differ."""
+    rows = ["from,until,node,peer", "0,3,0,1", "2,6,1,2", "5,9,0,2"]
+    write(tmp_path / "contacts.csv", rows)
+    rows = ["t,node,x,y", "0,0,0,0", "0,1,1,0", "0,2,2,0", "3,2,0.5,0", "5,1,5,5", "7,1,0.3,0"]
+    write(tmp_path / "places.csv", rows)
+    activation, in_slots = SOME_LINKS[name], name == "slots"
+    if name == "contacts":
+        activation = {**activation, "clock": {"kind": "periodic", "period": 0.5}}
+        network = {"graph": {"kind": "complete", "nodes": 3}}
+    else:
+        graph = {"kind": "range", "nodes": 3, "radius": 1.6}
+        network = {"graph": graph, "positions": "places.csv"}
+    loss = {"kind": "bernoulli", "delivery": 0.6}
+    network |= {"activation": activation, "channel": {"loss": loss, "symmetric": False}}
+    sensor = {"nodes": [0, 1, 2], "H": [[1.0]], "R": [[0.5]]}
+    plant = {"kind": "linear", "F": [[0.9]], "Q": [[0.2]], "period": 1.0}
+    if not in_slots:
+        sensor["sampling"] = {"kind": "periodic", "period": 0.7}
+        plant = {"kind": "diffusion", "A": [[-0.1]], "B": [[0.5]]}
+    keys = {"format": 1, "name": name, "horizon": 10.0, "probe": 1.0, "network": network}
+    keys |= {"plant": {**plant, "cov": [[1.0]]}, "sensors": [sensor]}
+    weighted = {"kind": "covariance-intersection", "epsilon": 0.3}
+    keys["filter"] = {"kind": "diffusion"} if in_slots else weighted
+    (tmp_path / "run.toml").write_text(to_toml(keys))
+    run = netkf.simulate(netkf.load(tmp_path / "run.toml"), engine="simpy")
+    netkf.export_log(run, tmp_path / "log")
+    netkf.import_log(tmp_path / "log", "csv", tmp_path / "out")
+    replay = netkf.simulate(netkf.load(tmp_path / "out" / "scenario.toml"), engine="simpy")
+    assert netkf.first_difference(run, replay) is None
+    last = -1 if in_slots else None
+    np.testing.assert_array_equal(run.xhat[:last], replay.xhat[:last])
+    accounts = pd.read_csv(tmp_path / "out" / "accounts.csv")
+    assert accounts["sent"].sum() == run.count("send")
+    assert not accounts["unknown"].any()
+
+
+PAIRS = """
+format = 1
+name = "pairs"
+horizon = 10.0
+probe = 1.0
+plant = { kind = "linear", F = [[0.9]], Q = [[0.1]], period = 1.0, cov = [[1.0]] }
+sensors = [{ nodes = [0], H = [[1.0]], R = [[0.5]] }]
+[network]
+graph = { kind = "complete", nodes = 3 }
+activation = { kind = "matching", protocol = "one-edge" }
+channel = { symmetric = false }
+[filter]
+kind = "gossip"
+"""
+
+
+@pytest.mark.parametrize(
+    ("rows", "sent", "told"),
+    [
+        (["1,0,1,0,1", "1,1,0,0,1", "2,0,1,1,0", "2,1,0,1,1"], 4, ""),
+        (["1,0,1,0,1", "2,1,0,0,1"], 4, "sent beside the log: 2 messages the other way"),
+        (["1,0,1,0,1", "1.5,0,1,1,1", "1,1,0,0,1"], 2, "merged: 1 message with another"),
+    ],
+)
+def test_a_log_beneath_a_filter_that_exchanges_in_pairs(rows, sent, told, tmp_path):
+    log = write(tmp_path / "log.csv", ["t,sender,receiver,number,heard", *rows])
+    (tmp_path / "pairs.toml").write_text(PAIRS)
+    _, notes = netkf.import_log(log, "csv", tmp_path / "out", like=tmp_path / "pairs.toml")
+    assert told in str(notes)
+    assert told or "beside" not in str(notes)
+    assert netkf.simulate(netkf.load(tmp_path / "out" / "scenario.toml")).count("send") == sent
+    both = ["1,0,1,0,1", "1,0,2,0,1", "2,1,2,0,1"]
+    log = write(tmp_path / "log.csv", ["t,sender,receiver,number,heard", *both])
+    with pytest.raises(ScenarioError, match="nodes send broadcasts, as in the log"):
+        netkf.import_log(log, "csv", tmp_path / "no", like=tmp_path / "pairs.toml")
+
+
+def test_what_nobody_in_the_scenario_sent_is_dropped_and_told(tmp_path):
+    rows = ["t,sender,receiver,number,event"]
+    rows += [f"{k},{i},,{k},tx" for k in range(1, 5) for i in (0, 1, 9)]
+    rows += [f"{k},{k % 2},{1 - k % 2},{k},rx" for k in range(1, 5)]
+    (tmp_path / "pairs.toml").write_text(PAIRS)
+    log, out = write(tmp_path / "log.csv", rows), tmp_path / "out"
+    _, notes = netkf.import_log(log, "csv", out, like=tmp_path / "pairs.toml")
+    assert "dropped: 4 transmissions of nodes that the scenario has not: 9" in notes
+    assert netkf.simulate(netkf.load(out / "scenario.toml")).count("deliver") == 4
+
+
+def test_a_replay_lasts_until_the_last_packet_is_heard(tmp_path):
+    rows = ["t,sender,receiver,t_heard", *(f"{k},0,{1 + k % 2},{k + 1.5}" for k in range(1, 6))]
+    log, out = write(tmp_path / "log.csv", rows), tmp_path / "out"
+    netkf.import_log(log, "csv", out)
+    assert netkf.simulate(netkf.load(out / "scenario.toml")).count("deliver") == 5
+
+
 SENSORS = [{"nodes": [0], "H": [[1.0, 0.0]], "R": [[0.25]]}]
 
 
