@@ -33,7 +33,7 @@ MAX_STEADY_ENTRIES = 100_000
 
 def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
     """Return traces at ``times``: bound on P, its limit, a central filter's; or the reason."""
-    bound, reason = None, ""
+    bound, reached, reason = None, None, ""
     try:
         scenario = scenario_of_estimates(scenario)
     except TheoryError as error:
@@ -42,11 +42,12 @@ def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
     try:
         if len(times):
             _require_small_bound(scenario, len(times))
-            bound = np.trace(covariance_bound(scenario, times), axis1=2, axis2=3)
+            P = covariance_bound(scenario, times)
+            bound, reached = np.trace(P, axis1=2, axis2=3), P[-1]
     except TheoryError as error:
         reason = str(error)
     last = scenario.last_piece
-    steady_note, label = _steady_note(last), limit_label(last)
+    steady_note, label = _steady_note(last, reached), limit_label(last)
     return PromisedTraces(
         bound=bound,
         limit=_trace_or_nan(limit_covariance, last),
@@ -72,7 +73,8 @@ def _require_small_bound(scenario: Scenario, samples: int) -> None:
         )
 
 
-def _steady_note(scenario: Scenario) -> str:
+def _steady_note(scenario: Scenario, reached: FloatArray | None) -> str:
+    """Return what to say of the steady state of the bound, of which P (N, n, n) is ``reached``."""
     if scenario.slotted or reason_without_bound(scenario):
         return ""
     if len(scenario.nodes) * scenario.plant.n**2 > MAX_STEADY_ENTRIES:
@@ -82,7 +84,7 @@ def _steady_note(scenario: Scenario) -> str:
             "netkf theory"
         )
     try:
-        if has_steady_state(scenario):
+        if has_steady_state(scenario, reached):
             return ""
     except TheoryError as error:
         return f"steady state of the bound: {error}"

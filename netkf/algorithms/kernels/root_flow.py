@@ -156,24 +156,23 @@ def flow_table(
         norm = max(norm, float(np.abs(M).sum(axis=0).max()))
     # A power of two, so that multiples of the unit and its halves are exact.
     unit = 2.0 ** np.floor(np.log2(min(UNIT / max(norm, 1e-300), longest)))
-    E, F, Q_g, G = transition_series(A, Q, whitened_H, np.zeros(1))
+    # Binary digits of the longest gap in units.
+    count = max(1, int(longest / unit).bit_length())
+    # Entries of a packed Q_g and exp(A g), and of F and a packed G_g where something is observed.
+    width = n * (n + 1) // 2 * (1 + (len(whitened_H) > 0)) + n * n * (1 + (len(whitened_H) > 0))
+    # As many cells as fit the cache budget. Cell k covers [k, k + 1) units around its middle. The
+    # first is expanded at 0, where Q_g = 0 and short gaps lose no digits.
+    octaves = max(1, min(CELLS, CELL_BYTES // (8 * CELL_TERMS * width))).bit_length() - 1
+    middles = unit * (np.arange(2 ** min(octaves, count - 1)) + 0.5)
+    middles[0] = 0.0
+    E, F, Q_g, G = transition_series(A, Q, whitened_H, middles)
     blocks, bound = information_blocks(whitened_H, F[0], unit)
     # The reach comes first: a table that is padded to a common width still has it there.
     gamma = [np.roll(with_reach(block.astype(np.float64), unit), 1, axis=1) for block in blocks]
-    # Binary digits of the longest gap in units.
-    count = max(1, int(longest / unit).bit_length())
     levels = double_levels(E[0], F[0], Q_g[0], blocks, scale, unit, count)
-    # Entries of a packed Q_g and exp(A g), and of F and a packed G_g where something is observed.
-    width = n * (n + 1) // 2 * (1 + (len(whitened_H) > 0)) + n * n * (1 + (len(whitened_H) > 0))
-    # As many cells as fit the cache budget, and none beyond the longest level.
-    max_cells = min(CELLS, CELL_BYTES // (8 * CELL_TERMS * width), 2 ** (len(levels) - 1))
-    octaves = max(0, max_cells.bit_length() - 1)
-    if octaves:
-        # Cell k covers [k, k + 1) units around its middle. The first is expanded at 0, where Q_g =
-        # 0 and short gaps lose no digits.
-        middles = unit * (np.arange(2**octaves) + 0.5)
-        middles[0] = 0.0
-        E, F, Q_g, G = transition_series(A, Q, whitened_H, middles)
+    # No cell lies beyond the longest level.
+    octaves = min(octaves, len(levels) - 1)
+    E, F, Q_g, G = (part[: 2**octaves] for part in (E, F, Q_g, G))
     cell_series = pack_series(E, F, Q_g, G, len(whitened_H) > 0)
     # From its middle a cell reaches half a unit, but the first one reaches a whole unit.
     series = np.stack(

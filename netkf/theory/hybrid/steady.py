@@ -59,9 +59,15 @@ def steady_covariance_bound(scenario: Scenario) -> FloatArray:
     return P.copy()
 
 
-def has_steady_state(scenario: Scenario) -> bool:
-    """Return True if H(12) has a steady state; raises TheoryError if H(12) does not apply."""
-    return _steady_state_of(scenario) is not None
+def has_steady_state(scenario: Scenario, near: FloatArray | None = None) -> bool:
+    """Return True if H(12) has a steady state; raises TheoryError if H(12) does not apply.
+    Covariances ``near`` (N, n, n) it, such as those that the bound has reached, save most steps.
+    """
+    if near is None:
+        return _steady_state_of(scenario) is not None
+    # The search takes covariances that are positive definite.
+    first = near + 1e-6 * np.abs(near).max() * np.eye(near.shape[-1])
+    return steady_state(coupled_riccati(scenario), first) is not None
 
 
 @lru_cache(maxsize=8)
