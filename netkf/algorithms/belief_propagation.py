@@ -462,10 +462,7 @@ class BeliefPropagation(Filter):
         )
 
     def _check_scenario(self, scenario: Any) -> None:
-        """Raise ScenarioError if messages are kept (``memory`` "all", or clocks) and the plant of a
-        ``netkf.Scenario`` has process noise, which would make them dependent, or modes whose
-        evidence would lose its digits before the horizon.
-        """
+        """Raise ScenarioError where messages that are kept depend on each other, or lose digits."""
         if scenario.slotted and self.memory == SLOT:
             return
         key, (A, Q) = "Q" if scenario.slotted else "B", scenario.believed_pieces[0]

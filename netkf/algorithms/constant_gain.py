@@ -211,10 +211,7 @@ class ConstantGain(Filter):
         )
 
     def _check_scenario(self, scenario: Any) -> None:
-        """Raise ScenarioError where the gains do not fit a ``netkf.Scenario``: recorded sensors
-        in continuous time, another number of gains than of nodes, or a gain that is not n x p for
-        the p rows of a node.
-        """
+        """Raise ScenarioError where the gains do not fit a ``netkf.Scenario``."""
         for k, sensor in enumerate(scenario.sensors):
             # A node may have several rows at one instant, and a gain weighs one reading.
             if not scenario.slotted and isinstance(getattr(sensor, "path", None), SourceFile):

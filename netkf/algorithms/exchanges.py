@@ -44,9 +44,7 @@ def exchanges_estimates(kernels: Kernels, record: Record) -> bool:
 
 @cache
 def _names(kernels: Kernels) -> frozenset[str]:
-    """Return the names of fields in ``emit`` and ``absorb`` and in all kernels that they call, and
-    of whatever else they use that is no number, no kernel and not of ``linalg``.
-    """
+    """Return the names in ``emit``, ``absorb`` and kernels that they call, but of ``linalg``."""
     found, texts = set[str](), [_text(kernels.emit), _text(kernels.absorb)]
     for text in texts:  # grows
         for name in text.__code__.co_names:

@@ -172,9 +172,7 @@ class InformationConsensus(Filter):
         return Analysis(paper="information_consensus", payload_numbers=self._message_size)
 
     def _message_size(self, n: int, rows: int, phase: int) -> int:
-        """Return the size of a message in numbers of 64 bits: K pairs (Omega, q) of n states in
-        slots, one pair under clocks (``phase`` -1).
-        """
+        """Return the size of K pairs (Omega, q) in numbers of 64 bits; K is 1 under clocks."""
         pairs = 1 if phase < 0 else len(self.recipe(2).shares)
         return pairs * (n + n * (n + 1) // 2)
 
@@ -233,10 +231,7 @@ class Hcmci(InformationConsensus):
         )
 
     def _check_scenario(self, scenario: Any) -> None:
-        """Raise ScenarioError if a ``netkf.Scenario`` has clocks and the variant is not
-        "information", if a novelty weight is given to that variant, which does not use it, or if
-        rounding of information would take the first covariance.
-        """
+        """Raise ScenarioError where the variant does not fit a ``netkf.Scenario``."""
         check_information(scenario)
         if not scenario.slotted and self.consensus != INFORMATION:
             raise ScenarioError(

@@ -144,10 +144,7 @@ class Kcf(Filter):
         return Analysis(paper="kalman_consensus", payload_numbers=self._message_size)
 
     def _message_size(self, n: int, rows: int, phase: int) -> int:
-        """Return the size of a message about n states in numbers of 64 bits: (u, U, xbar) with
-        u = H' R^-1 y and U = H' R^-1 H, or xbar alone from a node without ``rows`` of readings or
-        if readings are not shared.
-        """
+        """Return the size in 64-bit numbers of (u, U, xbar), or of xbar alone."""
         return 2 * n + n * (n + 1) // 2 if rows and self.share_readings else n
 
     shift = Filter.shift  # the class commutes with a shift, by its kernel

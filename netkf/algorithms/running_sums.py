@@ -104,9 +104,7 @@ def _tables_of(n: int, A: bytes) -> tuple[RateGroups, float, FloatArray]:
 
 
 def _table_of(groups: RateGroups) -> tuple[float, FloatArray]:
-    """Return the length of a cell (s), and Taylor coefficients (CELLS, terms, n n + G) around its
-    middle of M by rows and of each e^{-r_g gap}.
-    """
+    """Return the length of a cell (s), and Taylor coefficients (CELLS, terms, n n + G)."""
     kept, rates, terms = groups.kept, groups.rates, len(ORDER_9) + 1
     norm = max(np.abs(kept).sum(axis=1).max(), rates.max(initial=0.0), 1e-300)
     unit, n = 2.0 ** np.floor(np.log2(REACH / norm)), len(kept)

@@ -517,10 +517,7 @@ class StochasticTrigger(Filter):
         return replace(self.wrapped.analysis, wrapped=self.wrapped)
 
     def _check_scenario(self, scenario: Any) -> None:
-        """Raise ScenarioError if the filter that sends does not run in slots, sends nothing or has
-        a trigger itself, or if Y is a matrix that does not fit the readings of each node of a
-        ``netkf.Scenario``.
-        """
+        """Raise ScenarioError where the inner filter or Y does not fit a ``netkf.Scenario``."""
         inner = self.inner
         if (
             inner.analysis.wrapped is not None

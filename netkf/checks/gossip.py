@@ -61,19 +61,13 @@ PROBABILITY_TOLERANCE = 0.05  # of a probability: smaller errors change no concl
 
 
 def _summarise(scenario: Scenario, run: Run) -> ReplicaSummary:
-    """Return the summary of a run at K slots and N sampled nodes, with values at the K slots and at
-    the last one; ``replayed`` is the recursion of the gossip paper, G (10), along the swaps of the
-    run: neighbours swap their pairs (estimate, covariance), then each node updates the pair that it
-    holds with its own reading.
-
-    bounds    : (K, N, n, n) covariances that the last WINDOW readings of each node's pair give
-                alone, from an unknown state on: upper bounds on P
-    tokens    : (N, n, n) covariance at the last slot of the pair that started at each node (token
-                k is the pair that started at node k); arbitrary if pairs were copied, not swapped
-    moves     : (M,) number of slots, from slot 1 on, in which j handed its pair to i, for each of
-                the M (i, j) of :func:`_pairs_to_count`
-    slots     : number of slots counted in ``moves``
-    """
+    """Return the summary of a run, with the recursion of the gossip paper, G (10), in it."""
+    # Of K slots, N sampled nodes and the M pairs of _pairs_to_count, along the swaps of the run:
+    # bounds (K, N, n, n)  covariances that the last WINDOW readings of each node's pair give alone,
+    #                      from an unknown state on: upper bounds on P
+    # tokens (N, n, n)     covariance at the last slot of the pair that started at each node;
+    #                      arbitrary if pairs were copied, not swapped
+    # moves (M,)           number of slots, from slot 1 on, in which j handed its pair to i
     slots, summary = list(check_slots(scenario)), summarise_exactly(scenario, run)
     sources = pair_sources(scenario, run, slots[-1])
     summary.moves = _count_moves(scenario, sources[1 : slots[-1]])

@@ -95,19 +95,14 @@ def _least_roots(scenario: Scenario) -> FloatArray:
 
 
 def _summarise(scenario: Scenario, run: Run) -> ReplicaSummary:
-    """Return the summary of a run at K slots and N sampled nodes, with values at the last slot, and
-    counts for the D directed links that can carry readings.
-
-    ``replayed`` is the Riccati recursion, R (15)-(18), with the readings that arrived in the run,
-    from P(0). With the same readings:
-
-    in_support : (N, n, n) P from the start P*, the steady covariance of a node that gets all
-                 readings: a point of the support of the invariant law, R Theorem 10
-    spread     : (N,) trace of the difference between P from a very large start and P from 0; the
-                 recursion is monotone, so that any other start ends between these two
-    averages   : (N,) averages of 1 / (1 + tr P) over the second half of the slots
-    sent, arrived : (D,) readings sent and delivered in time
-    """
+    """Return the summary of a run, with the recursion R (15)-(18) of the readings that arrived."""
+    # Of N sampled nodes and the D directed links that can carry readings, with the same readings:
+    # in_support (N, n, n) P from the start P*, the steady covariance of a node that gets all
+    #                      readings: a point of the support of the invariant law, R Theorem 10
+    # spread (N,)          trace of the difference between P from a very large start and P from 0;
+    #                      the recursion is monotone: any other start ends between these two
+    # averages (N,)        averages of 1 / (1 + tr P) over the second half of the slots
+    # sent, arrived (D,)   readings sent and delivered in time
     slots, summary = list(check_slots(scenario)), summarise_exactly(scenario, run)
     last = slots[-1:]
     summary.sent = _count_messages(scenario, run, "send", slots[-1])

@@ -69,9 +69,8 @@ class Interruption:
         return self
 
     def _watch(self, descriptor: int) -> None:
-        """End the process END_SECONDS after a signal; runs in a thread of its own, because handlers
-        in Python wait until compiled code of the main thread returns.
-        """
+        """End the process END_SECONDS after a signal, also while compiled code runs."""
+        # In a thread of its own: handlers in Python wait until that code returns.
         while True:
             numbers = os.read(descriptor, 9)
             if not self._disarmed and any(n in self._previous_handlers for n in numbers):

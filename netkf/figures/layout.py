@@ -64,9 +64,7 @@ def _hops(topology: Topology) -> FloatArray:
 
 
 def _spring_layout(distances: FloatArray) -> FloatArray:
-    """Return positions (N, 2) of low stress, the sum of ``(|x_i - x_j| / d_ij - 1)^2``: searched
-    for from a circle and, where that ends at a much higher one, from classical scaling.
-    """
+    """Return positions (N, 2) of low stress, ``sum (|x_i - x_j| / d_ij - 1)^2``."""
     size = len(distances)
     angles, centre = 2.0 * np.pi * np.arange(size) / size, np.eye(size) - 1.0 / size
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)

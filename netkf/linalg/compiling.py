@@ -253,9 +253,7 @@ def _widen_arguments(function: Any) -> None:
 
 
 def _compile_well(function: Any, method: str, loops: Callable[..., Any]) -> None:
-    """Keep the code of a function of numba on disk, and let the ``method`` by which it is compiled
-    use LLVM's level 2, and link once.
-    """
+    """Keep compiled code on disk, and let ``method`` use LLVM's level 2 and link once."""
     # Level 3 takes a quarter longer and gains nothing here.
     from llvmlite.binding import set_option
 

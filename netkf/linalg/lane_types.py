@@ -78,9 +78,7 @@ def _are_values(kinds: Any) -> bool:
 def _implement(
     function: Any, result: Any, *signatures: Any
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Return a decorator of the function that emits a call of ``function``; ``result`` is its type,
-    or a function of those of the arguments, None where they do not fit.
-    """
+    """Return a decorator of what emits calls of ``function``, which returns a ``result``."""
 
     class Typing(AbstractTemplate):
         def generic(self, args: Any, _kws: Any) -> Any:

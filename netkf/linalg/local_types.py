@@ -30,9 +30,7 @@ from netkf.linalg.structs import WORD
 def _register(
     function: Callable[..., Any], dimensions: int, lanes: bool, more_columns: int = 0
 ) -> None:
-    """Register a function of arrays with so many ``dimensions`` of n, the last of them longer by
-    ``more_columns``, and L with ``lanes``.
-    """
+    """Register a function of arrays with ``dimensions`` of n, and L with ``lanes``."""
 
     @type_callable(function)
     def _typer(_: Any) -> Callable[..., Any]:

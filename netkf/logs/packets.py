@@ -329,9 +329,8 @@ def _sent_all_that_was_heard(sends: pd.DataFrame) -> np.ndarray:
 
 
 def _in_holes(log: PacketLog, whole: pd.DataFrame, hole: float) -> np.ndarray:
-    """Return flags of outcomes in a hole of the receiver's log: it reports nothing of two senders
-    or more, of whose packets it would have heard ``hole``, while another reports something.
-    """
+    """Return flags of outcomes in a hole of a log, that would have heard ``hole`` packets."""
+    # It reports nothing of two senders or more, while another receiver reports something.
     sends = log.sends.iloc[whole["send"]]
     rows = pd.DataFrame({"receiver": whole["receiver"], "missing": whole["told"].isna()})
     rows["t"], rows["sender"] = sends["t"].to_numpy(), sends["sender"].to_numpy()

@@ -62,9 +62,7 @@ class ScheduledLoss(Loss, OnGrid):
     def _steps(
         self,
     ) -> tuple[dict[Link, tuple[FloatArray, FloatArray]], Columns, list[tuple[Link, float, float]]]:
-        """Times (K,) and probabilities (K,) by link, the table, and link, beginning and end of each
-        row.
-        """
+        """Times and probabilities (K,) by link, the table, and link and times of each row."""
         table = _read_deliveries(self.path, ("from", "until", "sender", "receiver"))
         begins, ends, values = (table[name].tolist() for name in ("from", "until", "delivery"))
         links = list(zip(table.integers("sender"), table.integers("receiver"), strict=True))
@@ -152,9 +150,7 @@ class Hopping(Component):
     def _table(
         self,
     ) -> tuple[Mapping[tuple[int, Link | None], float], Columns, list[tuple[int, Link | None]]]:
-        """The deliveries by channel and directed link (None: all), the table, and the channel and
-        link of each row.
-        """
+        """Deliveries by channel and link (None: all), the table, channel and link of each row."""
         table = _read_deliveries(self.path, ("channel",), ("sender", "receiver"))
         channels: list[int] = table.integers("channel")
         links: list[Link | None] = [None] * len(channels)

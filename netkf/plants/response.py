@@ -35,9 +35,7 @@ class Response(Protocol):
 
 @kernel(allocates=True)
 def _recur(start: FloatArray, moves: FloatArray, drive: FloatArray, out: FloatArray) -> None:
-    """Write ``m[k+1] = moves[k] m[k] + drive[k]`` from m[0] = ``start`` (n,) on into ``out`` (K,
-    n); of ``moves`` (K, n, n) or (1, n, n) the last one goes on.
-    """
+    """Write ``m[k+1] = moves[k] m[k] + drive[k]`` from m[0] = ``start`` into ``out`` (K, n)."""
     m = start.copy()
     for k in range(len(drive)):
         move = moves[min(k, len(moves) - 1)]

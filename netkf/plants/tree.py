@@ -269,9 +269,7 @@ def divide_cell(size: Size, cells: Cells, walk: Walk, depth: int) -> None:
 
 
 def _cells(moves: Transitions, digits: int, decades: int, first_level: int) -> Cells:
-    """Return the cells of ``decades`` powers of ten of a tick of 10^-``digits`` s, whose second ids
-    are larger by ``first_level``.
-    """
+    """Return the cells of ``decades`` powers of ten of a tick of 10^-``digits`` s."""
     share, exponent = np.tile(np.arange(4), decades), np.repeat(np.arange(decades), 4)
     unit = np.array([10**e for e in exponent.tolist()], dtype=np.int64)
     before, after = (np.array(parts)[share] * unit for parts in (LEFT, RIGHT))

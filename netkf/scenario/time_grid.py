@@ -74,9 +74,7 @@ def _choose_automatically(scenario: Any) -> TimeGrid:
 
 
 def _added_times(scenario: Any) -> Iterator[Fraction | None]:
-    """Yield times beside those of fields that instants are sums of: what a bit takes on air, by how
-    much clocks are off, and times of tables, if all of those that are looked at are rational.
-    """
+    """Yield times that instants are sums of, beside fields, if all of them are rational."""
     network = scenario.network
     if network.radio is not None and network.radio.bits_per_second is not None:
         rate = as_fraction(network.radio.bits_per_second)

@@ -240,10 +240,7 @@ def _check_paths(
     laws: Sequence[tuple[FloatArray, FloatArray, str]],
     runs: int,
 ) -> None:
-    """Check the paths of a plant and its copy, ``draw(plant, at, run)`` (K, n) ``at`` K times. A
-    step is ``x[k+1] = Phi x[k] + w``, with ``laws`` in turn: Phi and the covariance of w, both
-    (n, n), and what messages call w.
-    """
+    """Check paths ``draw(plant, at, run)`` (K, n); ``laws`` are Phi and the covariance of w."""
     part, copy = plants
     field, rule, power = SLOT_TEXTS if isinstance(part, LinearPlant) else FLOW_TEXTS
     path, (when, few) = draw(part, at), subset

@@ -156,9 +156,7 @@ def solve_gain(f: Fusion, count: int) -> None:
 
 @kernel
 def _set_row(f: Fusion, A: FloatArray, M: FloatArray, i: int, inner: int) -> float:
-    """Write row ``i`` of ``A M``, with A (rows, inner), into ``row``; return its product with that
-    of A.
-    """
+    """Write row ``i`` of ``A M`` into ``row``; return its product with that of A (rows, inner)."""
     size = 0.0
     for d in range(inner):
         total = 0.0

@@ -304,9 +304,7 @@ def _use_points(
 
 @kernel
 def _whiten(rows: NonlinearRows, h: int) -> None:
-    """Divide the nonlinear rows ``rows.value`` and ``rows.J`` by the Cholesky factor of ``rows.C``;
-    rows whose value is nan are missing, and become 0.
-    """
+    """Divide nonlinear rows by the Cholesky factor of ``rows.C``; those of value nan become 0."""
     p, C, J, y = rows.kind.shape[1], rows.C, rows.J, rows.value
     for i in range(p):
         if rows.kind[h, i] == LINEAR or math.isnan(y[i]):

@@ -109,9 +109,7 @@ def _rate_of(
     model: RateTables, n: int, size: int, time: float, middle: float, state: FloatArray,
     out: FloatArray,
 ) -> None:  # fmt: skip
-    """Write the rate of change of ``state`` = (m, Phi, W), of which the first ``size`` numbers are
-    integrated, n or all, into ``out``.
-    """
+    """Write the rates of the first ``size`` numbers of ``state`` = (m, Phi, W) into ``out``."""
     set_input(model, time, middle)
     call_function(model.f, state[:n], model.u, time, 0.0, model.slope)
     for i in range(n):
@@ -199,9 +197,7 @@ def _move(
 
 @kernel
 def _write_noise_root(model: RateTables, n: int, first: int) -> None:
-    """Write the Cholesky factor of W, which ``model.state`` has from number ``first`` on, into the
-    last n columns of ``model.work``; W may be singular.
-    """
+    """Write a root of W, ``model.state[first:]``, into the last n columns of the work."""
     state, work, column = model.state, model.work, 2 * n + 1
     for j in range(n):
         for i in range(n):

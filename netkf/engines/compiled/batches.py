@@ -114,9 +114,7 @@ def _run_by_run(
 def _all_at_once(
     scenario: Scenario, workspace: Workspace, seed: int, replicas: range
 ) -> RunBatch | None:
-    """Simulate the runs in one call of a kernel; return None if the states of one overflow, or its
-    conserved sums count at the sample at which it diverges.
-    """
+    """Simulate the runs in one call; None if one of them must be simulated alone."""
     draws = BatchDraws(scenario, seed, replicas)
     start, runs = workspace.filters, len(replicas)
     # np.empty: runs that diverge go on to the end, so that all samples are written.

@@ -123,9 +123,7 @@ def has_known_h(sensor: NonlinearSensor) -> bool:
 def _functions_of(
     sensor: NonlinearSensor, p: int, entries: np.ndarray, states: int
 ) -> list[VectorFunction]:
-    """Return h, its Jacobian and the difference of a user's sensor, of ``entries`` (n,) of all
-    states; t is the id of a node.
-    """
+    """Return a user's h, Jacobian and difference, of ``entries`` (n,); t is the id of a node."""
     n, is_own = len(entries), entries >= 0
 
     def whole(x: FloatArray) -> FloatArray:

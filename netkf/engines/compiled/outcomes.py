@@ -269,9 +269,7 @@ def list_outcomes(
 def _transmissions(
     scenario: Scenario, senders: Senders, ticks: Sequence[FloatArray]
 ) -> Iterator[tuple[int, IntArray, FloatArray]]:
-    """Yield the id of each node, and of its transmissions, in the order of time, (K,) each: by
-    which entity they are made, and when; ``ticks`` in seconds of each entity.
-    """
+    """Yield each node, and by which entity and when it transmits, (K,) each, in order."""
     entities_of: dict[int, set[int]] = {}
     for e in range(len(ticks)):
         for w in senders.outgoing[senders.first[e] : senders.first[e + 1]].tolist():
@@ -287,9 +285,7 @@ def _transmissions(
 def _shared_draws(
     scenario: Scenario, streams: Streams, senders: Senders, ticks: Sequence[FloatArray]
 ) -> dict[tuple[int, int], BroadcastDraw]:
-    """Return what the hearers share of each tick of entity e at which a node sends, by (e, id of
-    the node), if they share anything.
-    """
+    """Return what the hearers share of each tick of entity e, if anything, by (e, id of sender)."""
     broadcasts, shared = broadcasts_of(scenario, streams), {}
     if broadcasts is None:
         return {}
@@ -308,10 +304,7 @@ def _waits(
     ticks: Sequence[FloatArray],
     heard: Sequence[np.ndarray] | None,
 ) -> dict[tuple[int, int], FloatArray]:
-    """Return the seconds until a node has sent the last bit of its message at each tick of entity
-    e, nan if it is dropped, by (e, id of the node), where radios take time. ``heard``: whether
-    anything is sent on a direction, if nodes move or are down.
-    """
+    """Return the seconds on air at each tick of entity e, nan if dropped, by (e, id of sender)."""
     found: dict[tuple[int, int], FloatArray] = {}
     if not scenario.messages_queue or scenario.network.radio is None:
         return found

@@ -367,9 +367,7 @@ def _sensor_tables(scenario: Scenario) -> SensorTables:
 def _make_instants(
     scenario: Scenario, t: FloatArray, sensor: np.ndarray, edges: np.ndarray = ONE_RUN
 ) -> Instants:
-    """Return the instants: times at which a node uses one or several samples at once. Samples of
-    several runs lie between ``edges``, and an instant that never comes ends each run.
-    """
+    """Return times of samples; one that never comes ends each run, of those between ``edges``."""
     tables = _sensor_tables(scenario)
     # Sensors whose H varies get a matrix for each sample, behind the fixed ones.
     varying, count = tables.varying[sensor], len(tables.rows)

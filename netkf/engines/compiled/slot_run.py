@@ -335,9 +335,7 @@ class SlotRuns:
     def _find_senders(
         self, times: SlotTimes, messages: SlotMessages, unread: np.ndarray
     ) -> np.ndarray:
-        """Return (B, S, E, N, L) 1 where nodes have links to send on; empty if messages are not
-        quantised.
-        """
+        """Return (B, S, E, N, L) 1 where nodes have links to send on; empty if all is exact."""
         if self._scenario.network.quantise is None:
             # Five dimensions, as kernels are compiled for.
             return np.zeros((0,) * 5, dtype=np.uint8)
@@ -583,9 +581,7 @@ class SlotRuns:
     def _draw_readings(
         self, times: SlotTimes, local: FloatArray, rebased: np.ndarray
     ) -> tuple[FloatArray, FloatArray]:
-        """Draw whitened readings ``H x + v`` (B, S, H, p, L) of S slots at the states ``local``
-        (B, S, n, L), zeros where there is none, and their H (B, S, H, p, n, L), or (1, 1, ...).
-        """
+        """Draw whitened readings (B, S, H, p, L) at states ``local`` (B, S, n, L), and their H."""
         setup, count = self.setup, local.shape[1]
         shape = self._blocks, count, setup.estimators, setup.p
         y: FloatArray = unset((*shape, LANES))
@@ -737,9 +733,7 @@ class SlotRuns:
     def _read_nonlinear(
         self, s: AssignedSensor, path: Any, sensed: np.ndarray, y: FloatArray, H: FloatArray
     ) -> None:
-        """Write the recorded values of a nonlinear sensor, nan where there is none, what they are
-        measured from, and the covariances of their noise.
-        """
+        """Write recorded values of a nonlinear sensor, their origins, and covariances."""
         sensor: Any = self._scenario.located_sensors[s.placed_sensor.entry]
         y[:, sensed, s.estimator, s.row : s.row + s.rows] = np.nan
         for k in np.flatnonzero(sensed).tolist():

@@ -283,9 +283,7 @@ class SlotTables:
         return uses
 
     def _share(self, uses: Uses, count: int) -> None:
-        """Write what all hearers of a broadcast share into what was drawn for the ``uses`` of so
-        many slots.
-        """
+        """Write what all hearers of a broadcast share into what was drawn for the ``uses``."""
         _, step, sender, back = self._transmissions(uses, count)
         numbers = numbers_of(sender, self._setup.fresh[step], self._shared_drawn)
         assert self._shared is not None
@@ -297,10 +295,7 @@ class SlotTables:
     def _transmissions(
         self, uses: Uses, count: int
     ) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-        """Return the slot, step and sender (K,) of each transmission of ``uses`` in so many slots,
-        in the order of time, and the number (D,) of the transmission of each use: one is for all
-        hearers.
-        """
+        """Return slot, step and sender (K,) of transmissions, and which (D,) each use has."""
         steps, nodes = len(self._setup.fresh), len(self._ids)
         key = (uses.slot * steps + uses.step) * nodes + self._sender[uses.w]
         is_sent = np.zeros(count * steps * nodes, dtype=bool)
@@ -310,9 +305,7 @@ class SlotTables:
         return slot, step, sender, (np.cumsum(is_sent) - 1)[key]
 
     def _used_links(self, times: StepTimes) -> tuple[IntArray, IntArray, IntArray, IntArray, Any]:
-        """Return the slot, step, place in the step and link of each use of a link, (U,) each, and
-        which directed links are then up, (D,) bool.
-        """
+        """Return slot, step, place in it and link (U,) of each use, and the links up (D,)."""
         setup = self._setup
         steps, links = len(setup.fresh), len(setup.ends)
         count, each = len(times.start), setup.directions_per_link
@@ -411,9 +404,7 @@ class SlotTables:
         return np.asarray(sends)
 
     def _send(self, times: StepTimes, uses: Uses, up: np.ndarray) -> Messages:
-        """Send a message over each of the uses (K,); write into ``up`` (S, E, W) which messages are
-        in the inbox when it closes.
-        """
+        """Send a message over each of the uses (K,); ``up`` (S, E, W) says which arrive in time."""
         w = uses.w
         number = numbers_of(w, np.ones(len(w), dtype=bool), self._sent_so_far)
         begin, closes = times.begin[uses.slot, uses.step], times.end[uses.slot, uses.step]
@@ -585,9 +576,7 @@ class SlotTables:
         )  # fmt: skip
 
     def _rows_between(self, times: StepTimes, messages: Messages) -> tuple[Rows, Rows]:
-        """Return the rows of messages that took time and of nodes that went up or down, until the
-        last moment of the block; keep the messages that are still under way.
-        """
+        """Return rows of slow messages and of lives until the block ends; keep later ones."""
         until, part = self._ends_of_parts(times)
         new = messages.of((messages.arrival > messages.sent) & (messages.outcome >= 0))
         under_way = Messages(*map(np.concatenate, zip(self._under_way, new, strict=True)))
@@ -653,9 +642,7 @@ class SlotTables:
 
 @once_per_scenario
 def _first_messages(scenario: Scenario) -> tuple[list[Transmission], FloatArray | None]:
-    """Return what is known of the first message of each directed link, and the delivery
-    probabilities (2, W) in a good and a bad state if they depend on nothing else.
-    """
+    """Return the first message of each directed link, and fixed deliveries (2, W)."""
     channel, directions = scenario.network.channel, slot_setup(scenario).directions
     first = [scenario.transmission(ends) for ends in directions]
     one_law = identical_per_link(channel.loss) or type(channel.loss) is GilbertElliott

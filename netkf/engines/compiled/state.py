@@ -411,9 +411,7 @@ def _linear(model: FlowModel) -> FlowModel:
 
 
 def _stack_model_tables(pieces: list[list[FlowModel]]) -> tuple[FlowTable, Gains]:
-    """Return the tables of the M models of each piece, with one without sensors at its end, and of
-    gains.
-    """
+    """Return the tables of the M models of each piece and of one without sensors, and of gains."""
     # The last model of a piece has no sensors: it predicts messages under way.
     flows = [[*(model.flow for model in models), models[0].unobserved_flow] for models in pieces]
     gains = [model.gains for models in pieces for model in (*models, models[0])]

@@ -340,9 +340,7 @@ def ticks_apart(clock: object) -> bool:
 
 
 def _is_listed(scenario: Scenario) -> bool:
-    """Return True if Python lists the ticks: of a user's clock or channel, of nodes that move or
-    whose clocks are wrong, or after samples.
-    """
+    """Return True if Python lists the ticks, as of a user's clock or of nodes that move."""
     network = scenario.network
     return (
         scenario.links_move
@@ -465,9 +463,7 @@ def _rates(scenario: Scenario) -> FloatArray:
 
 @once_per_scenario
 def _law_of_messages(scenario: Scenario) -> tuple[FloatArray, list[Transmission]]:
-    """Return the delivery probabilities (2, W) of a built-in loss, by state and direction, and for
-    a KernelLoss the first message of each direction.
-    """
+    """Return the deliveries (2, W) of a loss, by state, and the first messages of a KernelLoss."""
     directions, loss = senders_of(scenario).directions, scenario.network.channel.loss
     if law_in_kernels(loss):
         return np.ones((2, len(directions))), [scenario.transmission(w) for w in directions]

@@ -271,9 +271,7 @@ class _Simulation:
         nodes: dict[int, Any],
         estimates: list[tuple[FloatArray, FloatArray | None]],
     ) -> None:
-        """Record a sample of nodes that estimate different parts of the state, nan beyond them, at
-        the absolute and local ``states``, with the origin of the latter.
-        """
+        """Record a sample of nodes that estimate different parts of the state, nan beyond them."""
         scenario, diverged, (x, local, origin) = self._scenario, list[int](), states
         N, width = len(scenario.nodes), scenario.width
         xhat, error = (np.full((N, width), np.nan) for _ in range(2))

@@ -277,12 +277,10 @@ class Node:
         return envelopes, messages
 
     def _gated_payload(self, message: Message, time: float, recorder: Recorder) -> Any:
-        """Return a payload with its reading as the gate lets it pass. Estimates pass, because their
-        errors are correlated in an unknown way with those of the node, and readings of the past
-        and of pairs of blocks.
-        """
+        """Return a payload with its reading as the gate lets it pass."""
         payload, reading = message.payload, getattr(message.payload, "reading", None)
         whole = isinstance(payload, Payload) and payload.sender.kernels.sends_whole_readings
+        # Errors of estimates are correlated in an unknown way with those of the node.
         if not whole or reading is None or message.age > 0.0 or self.algorithm.needs.blocks:
             return payload
         # Whitened: the covariance of its noise is 1.

@@ -66,9 +66,7 @@ class Forms:
         return frozen[:, : self.frozen]
 
     def _reduce(self, count: int, first: FloatArray | None = None) -> FloatArray:
-        """Replace inputs that are not frozen by at most as many as rows, triangular in the order of
-        ``first`` (k, used), with room for ``count``; return ``first`` in the new columns.
-        """
+        """Replace inputs that are not frozen by few, and return ``first`` (k, used) in these."""
         rows, frozen = np.flatnonzero(self._live), self.frozen
         given = np.zeros((0, self.used)) if first is None else first
         old = np.concatenate([given, self.table[rows, : self.used]])

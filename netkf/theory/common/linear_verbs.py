@@ -322,12 +322,10 @@ class LinearVerbs:
         others: FloatArray = NO_FORMS,
         readings: Sequence[FloatArray] = (),
     ) -> None:
-        """Predict, and run a ``verb``, if there is one, on the numbers ``words`` (w,), and apply
-        their linear map to the forms. The first ``keep`` words are what may change, by default all;
-        the last ``written`` are only written. The verb depends on further numbers, whose forms are
-        ``others`` (k, C): ``places`` (k, 2) say row i of reading r, or entry i of the offset for
-        r = -1. With a message ``m`` it is ``emit``.
-        """
+        """Predict, run a ``verb``, if any, on ``words`` (w,), and apply its map to the forms."""
+        # The first ``keep`` words may change, or all; the last ``written`` are only written.
+        # The verb depends on further numbers, whose forms are ``others`` (k, C): ``places`` (k, 2)
+        # say row i of reading r, or entry i of the offset for r = -1. With ``m`` it is ``emit``.
         predict, act = address_of(self.kernels.predict, self._record, self.run), NOTHING
         if verb is not None:
             act = address_of(verb, self._record, self.run, 1 if m < 0 else 2)

@@ -147,9 +147,7 @@ def _from_tick_to_tick(
     directions: Directions,
     delay: float,
 ) -> SlotJumps:
-    """Return the system from exchange to exchange for periodic clocks that tick together. Without
-    increments a predicted message has the sender's error at arrival. Raises TheoryError.
-    """
+    """Return the system from exchange to exchange of periodic clocks that tick together."""
     _require_one_clock(clock, samples)
     N, n, _ = flow.drift.shape
     if delay > 0.0 and (delay >= clock.period or not (flow.drift == flow.drift[0]).all()):

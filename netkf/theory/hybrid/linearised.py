@@ -113,9 +113,7 @@ def _solve_by_gmres(
 
 
 def _rough_inverse(linear: LinearisedRiccati) -> Rows:
-    """Return roughly ``L^-1`` of rows X (N, m), or LinAlgError: a change that all nodes share,
-    then each node alone.
-    """
+    """Return roughly ``L^-1`` of rows X (N, m), or LinAlgError."""
     packed, n = linear.packed, linear.drifts.shape[1]
     if n <= MAX_PACKED:
         shared, inverse = linear.shared_map(), np.linalg.inv(linear.blocks)
