@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -302,7 +301,6 @@ def _assumptions(scenario: Scenario) -> list[Assumption]:
 def _promises(scenario: Scenario) -> tuple[Promise, ...]:
     listed, promised = list(PROMISES), with_promised_filter(scenario)
     # One function for each of LIMITS raises TheoryError if its subject does not exist.
-    requirements: tuple[Callable[[Scenario], object], ...]
     requirements = has_steady_state, _require_constant_gains, _require_limit
     for promise, require in zip(LIMITS, requirements, strict=True):
         with contextlib.suppress(TheoryError):

@@ -23,7 +23,7 @@ from netkf.theory.hybrid.coupled import (
     reason_without_bound,
 )
 from netkf.theory.hybrid.limits import central_covariance, limit_covariance
-from netkf.theory.hybrid.steady import has_steady_state
+from netkf.theory.hybrid.steady import has_steady_state, has_steady_state_near
 
 MAX_BOUND_BYTES, STAGES = 1.5 * 2**30, 30
 """Largest memory of a bound that is computed, and the stages that a step of its solver stores."""
@@ -84,7 +84,11 @@ def _steady_note(scenario: Scenario, reached: FloatArray | None) -> str:
             "netkf theory"
         )
     try:
-        if has_steady_state(scenario, reached):
+        if reached is None:
+            settles = has_steady_state(scenario)
+        else:
+            settles = has_steady_state_near(scenario, reached)
+        if settles:
             return ""
     except TheoryError as error:
         return f"steady state of the bound: {error}"

@@ -59,14 +59,15 @@ def steady_covariance_bound(scenario: Scenario) -> FloatArray:
     return P.copy()
 
 
-def has_steady_state(scenario: Scenario, near: FloatArray | None = None) -> bool:
-    """Return True if H(12) has a steady state; raises TheoryError if H(12) does not apply.
-    Covariances ``near`` (N, n, n) it, such as those that the bound has reached, save most steps.
-    """
-    if near is None:
-        return _steady_state_of(scenario) is not None
+def has_steady_state(scenario: Scenario) -> bool:
+    """Return True if H(12) has a steady state; raises TheoryError if H(12) does not apply."""
+    return _steady_state_of(scenario) is not None
+
+
+def has_steady_state_near(scenario: Scenario, P: FloatArray) -> bool:
+    """Return the same, in fewer steps if P (N, n, n) is near it, such as the bound at some time."""
     # The search takes covariances that are positive definite.
-    first = near + 1e-6 * np.abs(near).max() * np.eye(near.shape[-1])
+    first = P + 1e-6 * np.abs(P).max() * np.eye(P.shape[-1])
     return steady_state(coupled_riccati(scenario), first) is not None
 
 
