@@ -103,7 +103,7 @@ def work_on_study(plan: Plan, part: Part, pool: PoolOptions, options: argparse.N
         rest = "; the next round needs the runs of other parts: run it again then"
     else:
         rest = "; nothing is left to do" + (" in this part" if part.count > 1 else "")
-    print(f"{which} of {plan.directory}: {worker.simulated:,} runs simulated{rest}")
+    print(f"{which} of {plan.directory}: {count_phrase(worker.simulated, 'run')} simulated{rest}")
     return FAILED if worker.left or (rounds and gaps) else 0
 
 

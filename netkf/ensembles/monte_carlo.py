@@ -11,6 +11,7 @@ import numpy as np
 
 from netkf.core.fields import require_runs
 from netkf.core.notebook import NotebookTable
+from netkf.core.printable import count_phrase
 from netkf.core.wings import WINGS
 from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import Progress, replicate_blocks
@@ -68,8 +69,9 @@ class Ensemble(NotebookTable):
     scenario: Scenario | None = None
 
     def __repr__(self) -> str:
+        runs = count_phrase(int(self.runs.max()), "run")
         return (
-            f"<netkf.Ensemble: {self.runs.max():,} runs, {self.diverged:,} diverged, "
+            f"<netkf.Ensemble: {runs}, {self.diverged:,} diverged, "
             f"{len(self.times)} samples, {len(self.nodes)} nodes, {self.mean_P.shape[-1]} states, "
             f"seed {self.seed}>"
         )

@@ -37,6 +37,7 @@ def from_control(
     (m, m) of w, in continuous time its intensity; ``G=system.B`` is noise at the inputs, as
     ``control.lqe(system, Q, R)`` has it. ``R`` (p, p) is the covariance, or the intensity, of the
     noise of the outputs. If R is diagonal, node k reads output k, else node 0 reads all of them.
+    States have the names that python-control has for them.
 
     The network is complete, and the filter ``central``, the Kalman filter of all readings.
     ``changes`` are values by key, as in ``netkf.load``, for what a state space does not say:
@@ -70,6 +71,9 @@ def from_control(
     else:
         table |= _slots(1.0 if space.dt is True else space.dt)
         table["plant"] |= {"F": A, "Q": gain @ noise @ gain.T}
+    states = [str(label) for label in getattr(system, "state_labels", ())]
+    if states and not any("[" in name for name in states):  # x[0], .. if nobody named them
+        table["plant"]["states"] = states
     scenario = _scenario(table, C, R, space.B, changes)
     if np.any(space.D) and getattr(scenario.plant, "input", None) is not None:
         rule = "feeds the input through to the readings, which netkf does not"

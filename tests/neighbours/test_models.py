@@ -17,10 +17,10 @@ R = np.diag([0.2, 0.5])
 
 def test_a_continuous_system_ends_at_the_covariance_of_lqe():
     control = pytest.importorskip("control")
-    system = control.ss(A, B, C, np.zeros((2, 1)), name="pendulum")
+    system = control.ss(A, B, C, np.zeros((2, 1)), name="pendulum", states=["angle", "rate"])
     _, P, _ = control.lqe(system, [[0.3]], R)
     scenario = netkf.from_control(system, 0.3, R, {"horizon": 40.0}, G=system.B)
-    assert scenario.name == "pendulum"
+    assert (scenario.name, scenario.plant.states) == ("pendulum", ("angle", "rate"))
     run = netkf.simulate(scenario, engine="simpy")
     for node in range(2):
         np.testing.assert_allclose(run.P[-1, node], P, rtol=2e-3)
