@@ -165,7 +165,7 @@ def _build(cls: type[S], table: Mapping[str, Any], origin: Origin) -> Any:
     values = _build_inner(values, {"plant": partial(_build_plant, origin), "plants": blocks})
     plant = values.get("plant")
     if "plants" in values:
-        plant, values["plant"] = values["plants"][0].plant, None
+        plant, values["plant"] = getattr(values["plants"][0], "plant", NOT_IMPORTED), None
     time = "slot " if isinstance(plant, SLOTTED) else ""
     if plant is NOT_IMPORTED:
         time = "unknown"

@@ -386,6 +386,16 @@ def test_a_linear_f_is_the_linear_plant(custom, engine):
         np.testing.assert_allclose(run.P, linear.P, rtol=0.0, atol=tolerance)
 
 
+def test_a_users_f_moves_the_first_block(custom):
+    """Before its module is imported too, when it is not known yet whether there are slots."""
+    alone = netkf.load(custom)
+    text = custom.read_text().replace("[plant]", '[[plants]]\nname = "swing"')
+    custom.write_text(text.replace("swings:Swing", "others:Swing"))
+    (custom.parent / "others.py").write_text(MODULE)
+    run, alone = netkf.simulate(netkf.load(custom)), netkf.simulate(alone)
+    np.testing.assert_array_equal(run.xhat, alone.xhat)
+
+
 def test_a_users_f_runs_as_python_and_as_kernel(custom):
     python = netkf.load(custom)
     kernels = netkf.load(custom, {"plant.f": "swings:KernelSwing"})
