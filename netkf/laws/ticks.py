@@ -180,14 +180,17 @@ def _distance_from_lattice(law: Lattice, ticks: TickSeries) -> float:
     return float(max(spread.max() - law.jitter, early.max(), excess.max(), 0.0))
 
 
-def slack_of_start(group: ClockGroup, counts: np.ndarray) -> FloatArray:
+def slack_of_start(group: ClockGroup, counts: np.ndarray, windows: np.ndarray) -> FloatArray:
     """Return by how many ticks (E,) mean counts in a run of T seconds may differ from rate T though
     the rate is right: a renewal process has between rate T - 1 and rate T + c^2, c the coefficient
     of variation of its gaps (Lorden 1970). An unknown c^2 is the dispersion index of ``counts`` (R,
-    E).
+    E), or, where ticks come in groups, how far means of ``windows`` (R, W, E) stray from a line.
     """
     from_counts = SPREAD * counts.var(axis=0, ddof=1) / np.maximum(counts.mean(axis=0), 1e-300)
-    slack = np.where(np.isnan(group.spreads), from_counts, group.spreads)
+    path = np.cumsum(windows.mean(axis=0), axis=0)
+    shares = np.arange(1, len(path) + 1)[:, None] / len(path)
+    unknown = np.maximum(from_counts, SPREAD * np.ptp(path - shares * path[-1], axis=0))
+    slack = np.where(np.isnan(group.spreads), unknown, group.spreads)
     return np.asarray(np.maximum(slack, FIRST_TICK))
 
 

@@ -73,9 +73,10 @@ def check_clock(clock: Any, /, link: Link | None = None, **settings: Any) -> Non
 
     Statistical checks find these errors with probability 0.9. From 80,000 ticks of all links
     together: of Poisson clocks a rate that differs from ``mean_rate`` by 2.8 %, of others, with
-    gaps of a standard deviation of c times their mean, by 2.6 c + 1 %, and the rate of one of N
-    links that differs by sqrt(N) times as much (6 links: 7.5 %); if ``mean_rate`` is nan, a rate of
-    one link that differs from the others by as much. A class that states that it is
+    gaps of a standard deviation of c times their mean, by 2.6 c + 1 % (by more if ``gaps`` is not
+    stated and c is above 0.7 or ticks come in groups), and the rate of one of N links that differs
+    by sqrt(N) times as much (6 links: 7.5 %); if ``mean_rate`` is nan, a rate of one link that
+    differs from the others by as much. A class that states that it is
     ``memoryless``, or its law by ``gaps``, or derives from Renewal or Periodic and states nothing
     of its own, is compared with that law: a sixteenth of it that has 0.007 more or fewer gaps, and
     a correlation of 0.03 of neighbouring ones; of memoryless clocks a correlation of 0.08 of the
@@ -255,7 +256,7 @@ def _check_rates(
     watched: WatchedPart, group: ClockGroup, counts: TickCounts, unknown: np.ndarray, horizon: float
 ) -> None:
     ticks, distances, level = counts.ticks.sum(axis=1), [], 0.5 * family_level()
-    slack = slack_of_start(group, ticks)
+    slack = slack_of_start(group, ticks, counts.ticks)
     if not unknown.any():
         distances = rates_of_all(group, counts.ticks, float(slack.sum()), horizon, level)
     if not unknown.any() or len(unknown) > 1:

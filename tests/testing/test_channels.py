@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import pytest
 
 from netkf import parts
@@ -107,6 +108,22 @@ def test_our_own_clocks_keep_the_contract(tables):
     for part in [part for listed in ours.values() for part in listed]:
         assert check_clock(part) is None
     assert check_clock(parts.RecordedClock(tables["ticks"]), link=(1, 2)) is None
+
+
+@dataclass(frozen=True, eq=False)
+class Volleys(parts.LinkClock):
+    """Ten ticks in the first half of each second, from 1 s on."""
+
+    def ticks(self, entity, origin, index, now, random, count):
+        number = np.arange(index, index + count)
+        return 1 + number // 10 + 0.05 * (number % 10)
+
+    def mean_rate(self, entity):
+        return 10.0
+
+
+def test_a_clock_whose_ticks_come_in_groups_keeps_the_contract():
+    assert check_clock(Volleys()) is None
 
 
 @pytest.mark.one_in(12)

@@ -110,7 +110,7 @@ def _check_rates(clocks: Clocks, samples: PartSamples, level: float) -> Finding:
     if further:
         drawn = _drawn_counts(clocks, scenario, samples.seed, runs, further)
         counts = np.concatenate([counts, drawn])
-    slack = ticks.slack_of_start(group, counts)
+    slack = ticks.slack_of_start(group, counts, windows)
 
     def sample_factor(factor: float) -> float:
         """Return the factor on the number of counts of a clock for a factor on the runs."""
