@@ -5,7 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from netkf.algorithms.registry import overridden
+from netkf.core.printable import list_some
 from netkf.scenario.scenario import Scenario
+
+START_MARGIN = -1e-12
+"""The least eigenvalue of P_i(0) less the second moment of the error that counts as none."""
 
 
 def covariance_bias(scenario: Scenario) -> str:
@@ -16,9 +20,9 @@ def covariance_bias(scenario: Scenario) -> str:
     # P_by_design is about the steps of the built-in class, with links and linear readings.
     if overridden(algorithm) or not scenario.topology.links or not scenario.is_linear:
         return ""
-    # With a wrong model P need not be larger.
-    is_known = design == "smaller" or (design == "larger" and scenario.filters_know_the_truth)
-    return design if is_known else ""
+    # With a wrong model, or a start that is too sure, P need not be larger.
+    wide = scenario.filters_know_the_truth and not (start_note(scenario) or forgetting(scenario))
+    return design if design == "smaller" or (design == "larger" and wide) else ""
 
 
 def covariance_notes(scenario: Scenario) -> tuple[str, ...]:
@@ -44,6 +48,23 @@ def nees_note(scenario: Scenario) -> str:
     return ""
 
 
+def start_note(scenario: Scenario) -> str:
+    """Return a note on filters that begin too sure of the state, or empty."""
+    if not scenario.is_random or scenario.start_margin >= START_MARGIN:
+        return ""
+    return "filters begin with a P below the covariance of their first errors: P may be too small"
+
+
+def forgetting(scenario: Scenario) -> str:
+    """Return what nodes that forget do to P, or empty."""
+    if not scenario.forgetful_nodes:
+        return ""
+    return (
+        f"node {list_some(scenario.forgetful_nodes, 5)} begins again with the mean and covariance "
+        "of time 0, whatever the state is by then: P may be too small after that"
+    )
+
+
 def mismatch_note(scenario: Scenario) -> str:
     """Return a note on P and its bound if the filters' model may not be the truth, or empty."""
     if scenario.departures:
@@ -56,7 +77,7 @@ def mismatch_note(scenario: Scenario) -> str:
             "not be, or bound, the covariance of the error"
         )
     if scenario.filters_know_the_truth:
-        return ""
+        return "; ".join(filter(None, (start_note(scenario), forgetting(scenario))))
     if not scenario.is_random:
         return "whether P fits the errors depends on the model: the state or readings are recorded"
     if scenario.misses_input:

@@ -848,6 +848,21 @@ class DerivedScenario(ScenarioModel):
             )
         ]
 
+    @cached_property
+    def start_margin(self) -> float:
+        """The least eigenvalue, in units of P, of P_i(0) less the second moment of its error."""
+        plant, smallest = self.plant, np.inf
+        starts = ((*self.initial_estimate(i), k) for k, i in enumerate(self.nodes))
+        # Most networks have one start for all nodes.
+        for mean, cov, k in {(id(start[0]), id(start[1])): start for start in starts}.values():
+            view = self.model_view(k)
+            offset = plant.start_mean[view] - mean
+            gap = cov - plant.start_cov[view][:, view] - np.outer(offset, offset)
+            smallest = min(
+                smallest, float(np.linalg.eigvalsh(gap)[0]) / max(1.0, np.abs(cov).max())
+            )
+        return smallest
+
     def weight(self, receiver: int, sender: int) -> float:
         """Return the weight of the estimate of ``sender`` (id) at ``receiver``, pi_ij of paper H
         (7), a_ji of paper D (8): of the filter's matrix, rows senders, or by the degrees of both.

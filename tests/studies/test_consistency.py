@@ -12,6 +12,7 @@ import netkf
 from netkf.cli.main import main
 from netkf.core.errors import ScenarioError
 from netkf.rng.streams import Streams
+from netkf.runs.labels import covariance_bias, mismatch_note
 from netkf.scenario.reading import from_table
 from netkf.studies.consistency import (
     RunConsistency,
@@ -53,6 +54,27 @@ def test_cautious_filters_are_not_called_wrong(ring):
     for row in found.rows:
         assert row.expected < 1.9
         assert row.verdict == "as expected: P is conservative by design"
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("filter.cov", [[0.01, 0.0], [0.0, 0.01]], "begin with a P below"),
+        ("filter.mean", [3.0, 0.0], "begin with a P below"),
+        ("network.lives", [{"kind": "duty", "period": 2.0, "up": 1.0}], "node 1 begins again"),
+    ],
+)
+def test_no_filter_is_cautious_by_design_that_starts_too_sure(key, value, words, ring):
+    """P of the hybrid filter bounds its errors only if it does so when a node begins."""
+    sampled = {"nodes": [0, 3], "H": [[1.0, 0.0]], "R": [[0.25]]}
+    sampled["sampling"] = {"kind": "poisson", "rate": 3.0}
+    ring = ring.replace({"sensors": [sampled]})
+    assert covariance_bias(ring) == "larger"
+    if key == "network.lives":
+        value = [{**value[0], "nodes": [1], "memory": "lost"}]
+    changed = ring.replace({key: value})
+    assert covariance_bias(changed) == ""
+    assert words in mismatch_note(changed)
 
 
 def test_a_mismatched_model_is_as_bad_as_theory_says(gossip):

@@ -6,8 +6,8 @@ A record is one outcome and does not show the law that it came from: the verdict
 from __future__ import annotations
 
 from netkf.core.errors import TheoryError
-from netkf.core.printable import list_some
 from netkf.network.recorded import RecordedDelay, RecordedLoss
+from netkf.runs.labels import forgetting
 from netkf.scenario.model import EVERY_READING, HEALTHY
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.faults import fault_evidence
@@ -59,11 +59,7 @@ def life_rows(scenario: Scenario) -> list[AssumptionRow]:
         evidence = f"{LIVES}: equations hold along the events, bounds on the law of arrivals do not"
         rows.append(("nodes are up all the time", "all papers", False, evidence))
     if scenario.forgetful_nodes:
-        evidence = (
-            f"node {list_some(scenario.forgetful_nodes, 5)} begins again with the mean and "
-            "covariance of time 0, whatever the state is by then: P may be too small after that"
-        )
-        rows.append((MEMORY, "all papers", False, evidence))
+        rows.append((MEMORY, "all papers", False, forgetting(scenario)))
     return rows
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from netkf.core.printable import count_phrase
 from netkf.linalg.arrays import FloatArray, is_definite
+from netkf.runs.labels import START_MARGIN
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import AssumptionRow, judge_plant, true_model_row
 from netkf.theory.intermittent.riccati import undetectable_slot_mode
@@ -75,21 +76,15 @@ def slot_plant_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 def start_rows(scenario: Scenario, source: str) -> list[AssumptionRow]:
     """Return the row, by ``source``, that P_i(0) is at least the second moment of the error."""
-    plant, smallest = scenario.plant, np.inf
-    starts = ((*scenario.initial_estimate(i), k) for k, i in enumerate(scenario.nodes))
-    # Most networks have one start for all nodes.
-    for mean, cov, k in {(id(start[0]), id(start[1])): start for start in starts}.values():
-        # E[(x - xhat)(x - xhat)'] = cov of x(0) + the square of the difference of the means
-        view = scenario.model_view(k)
-        offset = plant.start_mean[view] - mean
-        gap = cov - plant.start_cov[view][:, view] - np.outer(offset, offset)
-        smallest = min(smallest, float(np.linalg.eigvalsh(gap)[0]) / max(1.0, np.abs(cov).max()))
+    smallest = scenario.start_margin
     return [
         (
             "P_i(0) >= E[(x(0) - xhat_i(0))(x(0) - xhat_i(0))']",
             source,
             *judge_plant(
-                scenario, smallest >= -1e-12, f"least eigenvalue of the difference {smallest:.3g}"
+                scenario,
+                smallest >= START_MARGIN,
+                f"least eigenvalue of the difference {smallest:.3g}",
             ),
         )
     ]
