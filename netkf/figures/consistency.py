@@ -144,7 +144,9 @@ def whiteness_figure(data: FigureData) -> Picture:
     figure = new_figure(7.4, 4.2)
     axes = figure.add_subplot()
     read = data.scenario.label_of_value(worst, 0, innovations.rows[innovations.nodes == worst])
-    _draw_correlations(axes, curves, (worst, read), band, lags)
+    place = data.scenario.topology.index.get(worst)
+    name = "all readings" if place is None else f"node {data.nodes[place]}"
+    _draw_correlations(axes, curves, (worst, name + f", {read}" * bool(read)), band, lags)
     share = outside / (lags * len(curves))
     judgement = (
         "as expected of white noise" if share <= WHITE_SHARE else "so innovations are not white"
@@ -158,7 +160,7 @@ def whiteness_figure(data: FigureData) -> Picture:
 def _draw_correlations(
     axes: Any, curves: dict[int, FloatArray], worst: tuple[int, str], band: float, lags: int
 ) -> None:
-    """Draw autocorrelations (lags,) by node, the ``worst`` with what it reads, and the ``band``."""
+    """Draw autocorrelations (lags,) by node, the ``worst`` with its name, and the ``band``."""
     positions = np.arange(1, lags + 1)
     axes.axhspan(-band, band, color=EXACT, alpha=0.2, lw=0, label="95% if white")
     axes.axhline(0.0, color=EXACT, lw=0.8)
@@ -175,8 +177,7 @@ def _draw_correlations(
         )
         mean = all_curves.mean(axis=0)
         axes.plot(positions, mean, "-o", color=INK, ms=3.5, label="mean of all nodes")
-    node, read = worst
-    name = ("all readings" if node < 0 else f"node {node}") + f", {read}" * bool(read)
+    node, name = worst
     label = plain(f"{name}, the largest" if len(curves) > 1 else name, 60)
     axes.plot(positions, curves[node], "--s", color=SENSING, ms=3.5, label=label)
     axes.set(xlabel="lag, readings of the node", ylabel="autocorrelation of innovations")

@@ -67,13 +67,16 @@ def describe_mending(explanation: Why) -> str:
     if same_trace and not abs(best.error - actual.error) > SAME_NUMBERS * actual.error:
         return "Messages would not have mended it: a replay in which none is missing is no better"
     error = _describe_change("error", actual.error, best.error)
+    is_less = best.error < actual.error if same_trace else best.trace < actual.trace
     if same_trace:
         change = f"{error} at the same trace P, {format_number(actual.trace)}"
     else:
         change = _describe_change("trace P", actual.trace, best.trace)
         change += f" and {error}" if math.isfinite(best.error) else ""
         change += _describe_smallest_set(explanation)
-    return f"To mend it: with no message missing, a replay gives {change}"
+    if is_less:
+        return f"To mend it: with no message missing, a replay gives {change}"
+    return f"With no message missing it would be no better: a replay gives {change}"
 
 
 class CentralSample(NamedTuple):

@@ -241,7 +241,8 @@ def _judge_node(
     scenario: Scenario, recorded: Innovations, chosen: np.ndarray, law: Law, level: float
 ) -> NodeInnovations:
     """Return the row of the node of ``chosen`` readings, with tests at ``level``."""
-    node, is_white = int(recorded.nodes[chosen[0]]), law.kind == "white"
+    node = scenario.nodes[scenario.topology.index[int(recorded.nodes[chosen[0]])]]
+    is_white = law.kind == "white"
     nis, rows = recorded.nis[chosen], recorded.rows[chosen]
     freedom, mean = float(rows.sum()), float(nis.sum() / rows.sum())
     whitened = [recorded.whitened[i] for i in chosen]

@@ -1,6 +1,7 @@
 """Pages without a browser: nothing from outside, every number the run's, every text escaped."""
 
 import base64
+import dataclasses
 import hashlib
 import json
 import re
@@ -28,7 +29,7 @@ from netkf.report.claims import describe_source
 from netkf.report.data import Budget, sample_indices
 from netkf.report.directories import read_source
 from netkf.report.markup import script_json
-from netkf.report.mending import explain_worst
+from netkf.report.mending import describe_mending, explain_worst
 from netkf.report.messages import information_age, thin_messages
 from netkf.report.page import make_page
 from netkf.report.tables import difference_curves
@@ -266,6 +267,15 @@ def test_errors_of_the_start_up_are_called_so(tmp_path):
     assert page.data["runs"][0]["worst"]["time"] == run.times[later]
     told = page.shown
     assert told.index("just started") < told.index("Why: ") < told.index("To mend it")
+
+
+def test_messages_mend_nothing_with_which_a_replay_is_worse(ring):
+    found = explain_worst(read_source(ring))
+    assert describe_mending(found).startswith("To mend it: with no message missing")
+    worse = dataclasses.replace(found.what_ifs[-1], trace=2.0 * found.what_ifs[0].trace)
+    found = dataclasses.replace(found, what_ifs=(*found.what_ifs[:-1], worse))
+    assert describe_mending(found).startswith("With no message missing it would be no better")
+    assert "(+100.0 %)" in describe_mending(found)
 
 
 def test_the_table_of_replays_has_the_changes_of_the_command_line(ring):

@@ -40,7 +40,7 @@ WALK = {
             "sampling": {"kind": "poisson", "rate": 2.0},
         }
     ],
-    "network": {"graph": {"kind": "cycle", "nodes": 3}},
+    "network": {"graph": {"kind": "cycle", "nodes": 4}},
     "filter": {"kind": "local"},
 }
 
@@ -300,6 +300,16 @@ def test_what_is_biased_has_its_name_and_unit(tmp_path):
     assert judge_innovations(unnamed, recorded, 0.99).rows[0].label == ""
     alone = judge_innovations(from_table(WALK, tmp_path), drawn(rng), 0.99)
     assert " of " not in format_innovations(alone).splitlines()[0]
+
+
+def test_nodes_have_the_names_of_the_scenario(tmp_path):
+    names = ["attic", "cellar", "roof", "shed"]
+    graph = {"kind": "edges", "nodes": names, "edges": [[names[k], names[k + 1]] for k in range(3)]}
+    sensors = [{**WALK["sensors"][0], "nodes": names}]
+    scenario = from_table(WALK | {"network": {"graph": graph}, "sensors": sensors}, tmp_path)
+    tests = judge_innovations(scenario, drawn(np.random.default_rng(7)), 0.99)
+    assert [str(row.node) for row in tests.rows] == names
+    assert [line.split()[0] for line in format_innovations(tests).splitlines()[2:6]] == names
 
 
 @pytest.mark.parametrize("kind", ["central", "local"])

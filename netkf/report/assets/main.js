@@ -139,7 +139,7 @@ function say() {
     }
     const counts = State.OUTCOMES.map((kind) => Format.count(of(kind)) + " " + kind).join(", ");
     const most = rows.length > Network.MAX_DRAWN ? ", of which " + Network.MAX_DRAWN + " are drawn" : "";
-    parts.push(Format.count(rows.length) + " messages on show" + app.filterWords() + most + ": " + counts);
+    parts.push(Format.count(rows.length) + (rows.length === 1 ? " message" : " messages") + " on show" + app.filterWords() + most + ": " + counts);
     return parts.join("; ") + ".";
   }).join(" ");
 }

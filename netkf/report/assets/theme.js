@@ -39,6 +39,8 @@ const Theme = (() => {
     context.textBaseline = "middle";
     context.textAlign = "left";
     context.lineWidth = 3;
+    const width = context.canvas.width / context.getTransform().a; // a long name would end outside
+    x = Math.max(0, Math.min(x, width - context.measureText(text).width - 3));
     context.strokeStyle = found.panel;
     context.strokeText(text, x, y);
     context.fillStyle = found.ink;

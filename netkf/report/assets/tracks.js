@@ -19,8 +19,8 @@ const Tracks = (() => {
   function rowsOf(app) {
     return app.runs.flatMap((run, r) => {
       const mark = app.runs.length > 1 ? "AB"[r] + " " : "";
-      return [...nodesOf(app, run).map((i) => ({ run, i, name: mark + "node " + run.names[i] })),
-        ...linksOf(app, run).map((link) => ({ run, link, i: link.receiver, name: mark + run.names[link.sender] + " \u2192 " + run.names[link.receiver] }))];
+      return [...nodesOf(app, run).map((i) => ({ run, i, mark: mark + "node ", ends: [run.names[i]] })),
+        ...linksOf(app, run).map((link) => ({ run, link, i: link.receiver, mark, ends: [run.names[link.sender], run.names[link.receiver]] }))];
     });
   }
 
@@ -91,7 +91,10 @@ const Tracks = (() => {
     context.textBaseline = "middle";
     context.textAlign = "right";
     context.fillStyle = Theme.colours.ink;
-    context.fillText(Format.brief(row.name, 15), LEFT - 6, y + ROW / 2);
+    const named = (most) => row.mark + row.ends.map((end) => Format.brief(end, most)).join(" \u2192 ");
+    let most = 16;
+    while (most > 2 && context.measureText(named(most)).width > LEFT - 8) most -= 1;
+    context.fillText(named(most), LEFT - 6, y + ROW / 2);
   }
 
   function drawAxis(context, scale, y) {
