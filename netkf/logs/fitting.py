@@ -149,9 +149,11 @@ def fit_log(
     confidence = float(number(above=0.0, below=1.0)("confidence", confidence))
     scenario = load(folder / "scenario.toml", trust=trust)
     table, notes = read_outcomes(scenario)
+    table, channels = _tell_channels(table, scenario.seed, notes)
     outcomes = make_outcomes(table)
     distance = _distances(scenario, outcomes, table)
     tests, share, time, edges = run_tests(outcomes, distance)
+    tests |= channels
     level = (1.0 - confidence) / max(sum(np.isfinite(t.p) for t in tests.values()), 1)
     test_table = _test_table(tests, level)
     rejected = {key for key, test in tests.items() if test.p < level}
@@ -226,15 +228,31 @@ def read_outcomes(scenario: Scenario) -> tuple[pd.DataFrame, list[str]]:
             f"{count:,} of them are of packets that nobody reported and count as lost; at_least "
             "and at_most in fit_links.csv say what else they may have been"
         )
-    untold = int((table["channel"] == "").sum()) if "channel" in table else 0
-    if 0 < untold < len(table):
-        notes.append(
-            f"{untold:,} of them are of packets whose channel nobody tells: deliveries of channels "
-            "and shared fate are of the others"
-        )
     if len(table) < sent and loss.after == "deliver":
         notes.append("messages that are not listed count as unknown, not as delivered")
     return table, notes
+
+
+def _tell_channels(
+    table: pd.DataFrame, seed: int, notes: list[str]
+) -> tuple[pd.DataFrame, dict[str, Test]]:
+    """Return a table whose messages all have a channel, or none of them, and the test of channels,
+    which is of those that are told; {} if all are.
+    """
+    untold = int((table["channel"] == "").sum()) if "channel" in table else 0
+    if not 0 < untold < len(table):
+        return table, {}
+    found, *_ = run_tests(make_outcomes(table), None)
+    test = {"channel": found["channel"]} if "channel" in found else {}
+    differ = bool(test) and test["channel"].p < MAYBE
+    what = "drawn, once, by how likely they are" if differ else "that of the others is not used"
+    notes.append(
+        f"{untold:,} of them are of packets whose channel nobody tells: {what}; the test of "
+        "channels is of the others"
+    )
+    if differ:
+        return stats.draw_channels(table, np.random.default_rng(seed)), test
+    return table.drop(columns="channel"), test
 
 
 def _read_table(path: Path) -> pd.DataFrame:
@@ -451,6 +469,11 @@ def _fit_laws(
         turns = np.concatenate(np.split(outcomes.transitions, 2, axis=1))
         values = (turns[:, 1] + 0.5) / (turns[:, 0] + 1.0)
         fit = _likelihood(turns[:, 1], np.maximum(turns[:, 0], 1.0))
+        # Outcomes after one that is not known have the law of all times.
+        bad, good = np.split(values, 2)
+        (tries, lost), (losses, found) = (part.T for part in np.split(turns, 2))
+        n, k = count - tries - losses, heard - (tries - lost + found)
+        fit += float(np.sum(xlogy(k, good / (bad + good)) + xlogy(n - k, bad / (bad + good))))
         laws.append(Law("per-link-bursts", values, fit, turns))
     if distance is not None and len(count) > 2:
         # What follows from places that change is no correlation in time.

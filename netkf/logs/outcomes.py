@@ -27,6 +27,7 @@ BLOCKS = 48
 """Parts of a log whose means tell of slow changes."""
 LAGS = 4
 """Lags of these means that are tested together."""
+EM_STEPS = 300
 MIN_PACKETS = 10
 """Packets of a link below which no test is made of it."""
 
@@ -133,6 +134,32 @@ class Outcomes:
         pairs = list(zip(self.groups, self.channels, strict=True))
         names = self.channel_names
         return np.stack([self._sum(tuple(g for g, c in pairs if c == name)) for name in names])
+
+
+def draw_channels(table: pd.DataFrame, random: np.random.Generator) -> pd.DataFrame:
+    """Return a ``table`` of messages in which those whose channel nobody tells, since nobody heard
+    them, have one drawn by how likely it is then: by EM, for hearers that are independent.
+    """
+    columns = {"n": ("delivered", "count"), "k": ("delivered", "sum"), "name": ("channel", "first")}
+    sends = table.groupby("transmission").agg(**columns)
+    untold = sends[sends["name"] == ""]
+    known = sends.drop(untold.index).groupby("name").agg(n=("n", "sum"), k=("k", "sum"))
+    told = known.to_numpy(dtype=float)
+    sent = sends["name"].value_counts()[known.index].to_numpy(dtype=float)
+    kinds, of, numbers = np.unique(
+        untold[["n", "k"]].to_numpy(dtype=float), axis=0, return_inverse=True, return_counts=True
+    )
+    counts, share, weights = told, sent, np.empty(0)
+    for _ in range(EM_STEPS):
+        p = np.clip(counts[:, 1] / counts[:, 0], 1e-9, 1.0 - 1e-9)
+        weights = share * p ** kinds[:, 1:] * (1.0 - p) ** (kinds[:, :1] - kinds[:, 1:])
+        weights /= weights.sum(axis=1, keepdims=True)
+        added = weights * numbers[:, None]
+        counts, share = told + added.T @ kinds, sent + added.sum(axis=0)
+    uniform = random.random(len(untold))[:, None]
+    drawn = (uniform > weights.cumsum(axis=1)[of.ravel(), :-1]).sum(axis=1)
+    found = table["transmission"].map(pd.Series(known.index[drawn], untold.index))
+    return table.assign(channel=table["channel"].where(table["channel"] != "", found))
 
 
 def make_outcomes(table: pd.DataFrame) -> Outcomes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from decimal import Decimal
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -62,6 +63,7 @@ LOST = ("lost", "loss", "drop", "dropped", "miss", "missed")
 YES = ("1", "1.0", "true", "yes", "y", "ok", *HEARD)
 NO = ("0", "0.0", "false", "no", "n", "fail", "failed", *LOST)
 UNKNOWN = ("", "nan", "na", "none", "unknown", "?", "-1")
+RARE = 0.1  # share of packets before which a sender changes its channel now and then
 MAX_CYCLE = 64  # channels over which packets of a sender hop in turn
 NO_STAMP = ("", "nan", "na", "nat", "none", "null", "-1", *LOST)  # of t_heard
 EXTRAS = ("positions", "readings")
@@ -232,6 +234,9 @@ def _find_columns(path: Path, raw: pd.DataFrame, notes: list[str]) -> dict[str, 
         names |= {"sender": "sender", "receiver": "receiver"}
     elif names["node"] and not (names["sender"] and names["receiver"]):
         # The node whose log it is: of what it sent, or of what it heard from a sender.
+        if names["sender"]:
+            own = raw[names["node"]]
+            raw[names["node"]] = own.mask(own == raw[names["sender"]], "")
         names["receiver" if names["sender"] else "sender"] = names["node"]
     elif names["node"]:
         # Beside whose log it is the receiver is an address, such as that of all.
@@ -289,6 +294,7 @@ def _read_outcomes(
         heard = np.select([groups[1], groups[2]], [1.0, 0.0], np.nan)
         if name == "event":
             what[groups[0]] = "tx"
+            what[groups[1] | groups[2]] = "rx"
         else:
             what[(table["receiver"] != "").to_numpy()] = "outcome"
     sender, receiver, remedy = table["sender"], table["receiver"], "correct the row"
@@ -444,6 +450,8 @@ def _skipped(sends: pd.DataFrame, notes: list[str]) -> pd.DataFrame:
         counters, times = own["counter"].to_numpy(), own["t"].to_numpy()
         channels = own["channel"].tolist()
         cycle = _find_cycle(counters, channels)
+        # One that hops at random is on no one channel between two packets on it.
+        moves = sum(a != b for a, b in pairwise(channels)) > RARE * len(channels)
         for k in np.flatnonzero(np.diff(counters) > 1).tolist():
             count = int(counters[k + 1] - counters[k])
             if count > MAX_SKIP:
@@ -452,7 +460,7 @@ def _skipped(sends: pd.DataFrame, notes: list[str]) -> pd.DataFrame:
             for j in range(1, count):
                 t = times[k] + (times[k + 1] - times[k]) * j / count
                 counter = int(counters[k]) + j
-                channel = channels[k] if channels[k] == channels[k + 1] else ""
+                channel = "" if moves or channels[k] != channels[k + 1] else channels[k]
                 channel = cycle[counter % len(cycle)] if cycle else channel
                 row = {"sender": sender, "t": round(t, 9), "channel": channel, "to": to}
                 row |= {"counter": counter, "sent": False, "logged": False}

@@ -332,6 +332,28 @@ def test_nodes_that_die_or_come_late_and_channels_in_turn(tmp_path):
     assert heard["inside"].all()
 
 
+def test_channels_of_packets_that_nobody_heard_are_not_invented(tmp_path):
+    """Those heard are more often on good channels, and at one hearer where not at the other."""
+    random, rows, quality = np.random.default_rng(24), ["t,src,dst,seq,channel"], (0.85, 0.3, 0.6)
+    for k in range(500):
+        for i in range(3):
+            c = random.integers(3)
+            heard = [j for j in range(3) if j != i and random.random() < quality[c]]
+            rows += [f"{k + 0.1 * i + 1:.1f},{i},{j},{k},c{c}" for j in heard]
+    (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
+    netkf.import_log(tmp_path / "log.csv", "csv", tmp_path / "out")
+    fit = netkf.fit_log(tmp_path / "out", runs=0)
+    verdicts = fit.tests.set_index("key")["verdict"]
+    assert (verdicts["channel"], verdicts["fate"]) == ("rejected", "not rejected")
+    hopping = pd.read_csv(tmp_path / "out" / "fit_hopping.csv")["delivery"]
+    np.testing.assert_allclose(np.sort(hopping.unique()), sorted(quality), atol=0.06)
+    assert any("whose channel nobody tells: drawn, once" in note for note in fit.notes)
+    # All laws are compared by the same outcomes.
+    likelihood = fit.laws.set_index("law")["log_likelihood"]
+    assert likelihood["per-link-bursts"] == pytest.approx(likelihood["per-link"], rel=0.03)
+    assert likelihood["hopping"] > likelihood["bernoulli"]
+
+
 def test_links_with_bursts_of_their_own(tmp_path):
     """The table of chains holds what follows what in the record, and its runs are like the log."""
     random, rows, bad = np.random.default_rng(5), ["t,src,dst,seq,heard"], {}

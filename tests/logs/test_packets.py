@@ -278,6 +278,18 @@ def test_a_node_that_logs_what_was_sent_to_an_address_heard_it(tmp_path):
     assert (len(run.nodes), run.count("deliver"), run.count("lost")) == (3, 60, 20)
 
 
+def test_a_node_that_logs_its_own_packet_sent_it(tmp_path):
+    rows = ["t,node,event,src,seq"]
+    for k in range(1, 9):
+        rows += [f"{k},a,SEND,a,{k}"] + [f"{k + 0.01},b,RECV,a,{k}"] * (k % 2)
+    log = write(tmp_path / "log.csv", [*rows, "9,b,SEND,b,1", "9.01,a,RECV,b,1"])
+    netkf.import_log(log, "csv", tmp_path / "out")
+    accounts = table(tmp_path / "out", "accounts.csv").set_index(["sender", "receiver"])
+    assert accounts.loc[("a", "b")].tolist() == [8, 4, 4, 0]
+    with pytest.raises(ScenarioError, match="line 2: must name a receiver"):
+        netkf.import_log(write(log, [rows[0], "1,a,RECV,a,1"]), "csv", tmp_path / "no")
+
+
 def test_a_clock_that_begins_again_is_told(tmp_path):
     """Node 2 boots at packet 100 and counts its seconds from 0 on, its numbers too in one log."""
     for name, first in (("numbers", 100), ("clock", 0)):
