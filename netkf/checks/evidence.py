@@ -177,6 +177,8 @@ def judge(
     take. With probability 1 - ``level`` all intervals contain the truth: tests that are not exact
     share it equally (Bonferroni). A promise with a failing assumption is not tested.
     """
+    # Those of a paper and of its tests may be the same.
+    assumptions = list(dict.fromkeys(assumptions))
     failing = [
         [row for row in assumptions if _is_needed(promise, row) and not row.holds]
         for promise in promises

@@ -133,3 +133,12 @@ def test_the_row_of_a_false_proposition_says_so():
     assert row["verdict"] == "not promised"
     assert "false here" in row["assumptions"]
     assert "below the threshold 2" in row["assumptions"]
+
+
+def test_a_row_gives_each_reason_once():
+    """Assumptions of the paper are also those of tests of the equations."""
+    near = {"kind": "range", "nodes": [0], "positions": [[5.0, 5.0]], "R": [[1.0]]}
+    curved = load("push_sum_planar").replace({"filter": {"kind": "kcf"}, "sensors": [near]})
+    rows = netkf.check(curved, runs=10, workers=1).table.set_index("source")
+    reason = rows.loc["all papers", "assumptions"]
+    assert reason.count("readings are linear in the state") == 1

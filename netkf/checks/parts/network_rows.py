@@ -25,6 +25,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.network.contacts import Contacts
 from netkf.network.delays import delay_depends_on_message
 from netkf.network.matchings import Matching
+from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.random_links import has_recorded_broadcasts
 
@@ -284,7 +285,7 @@ def loss_assumptions(scenario: Scenario) -> list[Assumption]:
         drawn, why = False, "a radio that is busy loses messages"
     elif has_recorded_broadcasts(scenario):
         drawn, why = False, "a table lists the links that are up; others lose their messages"
-    source, name = "the scenario", type(channel.loss).__name__
+    source, name = "the scenario", f"the loss {name_of('loss', channel.loss)!r}"
     stated = bool(np.isfinite(law.lost).all())
     changes = "" if law.steady else f"{name} changes it with the message"
     return [

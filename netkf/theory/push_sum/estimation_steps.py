@@ -10,6 +10,7 @@ import numpy as np
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, symmetric
 from netkf.network.matchings import Broadcast
+from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.random_links import delivery_of
 from netkf.theory.numerics.matrices import as_integer, as_number
@@ -121,8 +122,10 @@ def _probabilities(scenario: Scenario, delivery: float | None) -> FloatArray:
             raise TheoryError(f"delivery must lie in [0, 1], got {delivery!r}")
         return np.full((len(links), 2), delivery)
     if not scenario.network.channel.independent:
-        name = type(loss).__name__
-        raise TheoryError(f"the draws of {name} depend on each other: no mean square is known")
+        name = name_of("loss", loss)
+        raise TheoryError(
+            f"the draws of the loss {name!r} depend on each other: no mean square is known"
+        )
     # The first end hears the second by the direction (j, i).
     directions = [[(j, i), (i, j)] for i, j in links]
     hears = [[delivery_of(scenario, direction) for direction in pair] for pair in directions]
