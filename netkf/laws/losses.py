@@ -41,6 +41,7 @@ class LossLaw(NamedTuple):
     shared      : some of them do, so that each draw is counted twice
     at_once     : both directions carry messages at once and draw their own losses
     share       : probability that all hearers of a broadcast have one fate
+    hops        : (D, H) probability that message k is lost, on hop k mod H; None without hops
     """
 
     lost: FloatArray
@@ -53,6 +54,18 @@ class LossLaw(NamedTuple):
     shared: bool = False
     at_once: bool = False
     share: float = 0.0
+    hops: FloatArray | None = None
+
+    def expected(self, sent: np.ndarray) -> FloatArray:
+        """Return how many of the first messages ``sent`` (R, D) of directions are lost on average.
+
+        A run need not end with the last hop.
+        """
+        if self.hops is None:
+            return np.asarray(sent * self.lost)
+        sums = np.cumsum(np.pad(self.hops, ((0, 0), (1, 0))), axis=1)
+        cycles, rest = np.divmod(sent, self.hops.shape[1])
+        return np.asarray(cycles * sums[:, -1] + sums[np.arange(len(sums)), rest])
 
     @property
     def variance_factor(self) -> float:
@@ -147,10 +160,10 @@ def direction_label(link: tuple[int, int]) -> str:
 def _loss_interval(
     law: LossLaw, sent: np.ndarray, lost: np.ndarray, directions: np.ndarray, level: float
 ) -> Interval:
+    stated = law.expected(sent)[:, directions]
     q, sent, lost = law.lost[directions], sent[:, directions], lost[:, directions]
     total, losses = float(sent.sum()), lost.sum(axis=1)
-    excess = (lost - sent * q).sum(axis=1)
-    expected = float((sent * q).sum()) / total
+    excess, expected = (lost - stated).sum(axis=1), float(stated.sum()) / total
     if len(directions) == 1 and law.independent:
         limits = probability_interval(int(losses.sum()), int(total), level)
         return deviation_interval(expected, limits)
@@ -165,8 +178,8 @@ def _loss_interval(
     if rare:
         limits = share_of_bounded_runs(excess, sent.sum(axis=1), expected, level)
         return deviation_interval(expected, limits)
-    stated = float((sent * (q * (1.0 - q))).sum()) * law.variance_factor
-    return excess_interval(expected, excess, total, stated, level)
+    variance = float((sent * (q * (1.0 - q))).sum()) * law.variance_factor
+    return excess_interval(expected, excess, total, variance, level)
 
 
 def share_of_bounded_runs(

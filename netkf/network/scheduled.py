@@ -171,13 +171,14 @@ class Hopping(Component):
 
     def delivery(self, sent: Transmission) -> Any:
         """Return the probability that the message ``sent`` arrives on its channel."""
-        return self._per_hop(sent.link)[np.asarray(sent.number) % len(self.hopping)]
+        return self.on_hops(sent.link)[np.asarray(sent.number) % len(self.hopping)]
 
     def mean(self, link: Link) -> float:
         """Return the mean of that probability over the hops, for a directed link."""
-        return float(self._per_hop(link).mean())
+        return float(self.on_hops(link).mean())
 
-    def _per_hop(self, link: Link) -> FloatArray:
+    def on_hops(self, link: Link) -> FloatArray:
+        """Return the probabilities (H,) that a message on each of the hops arrives."""
         deliveries = self._table[0]
         key = None if (self.hopping[0], None) in deliveries else link
         return np.array([deliveries[channel, key] for channel in self.hopping])

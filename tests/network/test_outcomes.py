@@ -10,6 +10,7 @@ import pytest
 
 import netkf
 from netkf.checks.parts.events import loss_law
+from netkf.checks.parts.network_rows import LOSS_ROW
 from netkf.network.losses import Bernoulli, GilbertElliott, Loss, SharedLoss
 from netkf.trace.schema import CODES
 
@@ -266,6 +267,17 @@ def test_messages_hop(scenario_of):
         deviation = np.sqrt(p * (1 - p) / len(arrived))
         assert arrived.mean() == pytest.approx(p, abs=4.5 * deviation + 1e-12)
     assert scenario.mean_delivery((0, 1)) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("slots", [6, 7, 9])
+def test_check_knows_the_hops_of_a_run(scenario_of, slots):
+    """The mean over the hops is that of runs that end with the last one."""
+    scenario = scenario_of(SLOTS, *KINDS["hopping"], horizon=float(slots))
+    verdict = netkf.check(scenario, runs=50, workers=1)
+    row = verdict.table.set_index("promise").loc[LOSS_ROW.statement]
+    sent = [(0.2, 1.0, 0.6, 0.2)[k % 4] for k in range(slots - 1)]
+    assert row["expected"] == pytest.approx(1.0 - np.mean(sent))
+    assert row["verdict"] != "broken"
 
 
 class Dusk(Loss):

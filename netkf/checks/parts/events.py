@@ -155,6 +155,12 @@ def loss_law(scenario: Scenario) -> LossLaw:
     at_once = getattr(clock, "at", "links") == "links"
     senders, receivers = np.array(links, dtype=np.int64).reshape(-1, 2).T
     opposite = _places(links, [receivers, senders])
+    hops = None
+    if channel.channels is not None:
+        on_hops = [channel.channels.on_hops(link) for link in links]
+        once = dataclasses.replace(stated, channels=None)
+        alone = [once.mean_delivery(scenario.transmission(link)) for link in links]
+        hops = 1.0 - np.array(alone)[:, None] * np.array(on_hops)
     # Broadcasts of two nodes at different times would both step a chain that they share.
     one_step = isinstance(clock, Matching) or (
         isinstance(clock, LinkClock) and (clock.at == "links" or not channel.symmetric)
@@ -173,6 +179,7 @@ def loss_law(scenario: Scenario) -> LossLaw:
         at_once=at_once and not channel.symmetric,
         links=links,
         share=share,
+        hops=hops,
     )
 
 

@@ -311,7 +311,7 @@ def network_promises(samples: PartSamples) -> list[Promise]:
     promises.append(LOSS_ROW)
     if law.independent and ((law.lost > 0.0) & (law.lost < 1.0)).any():
         promises.append(LOSSES_APART)
-    if law.chain is not None:
+    if law.chain is not None and law.hops is None:
         promises.append(BURSTS)
     if law.share > 0.0 and np.ptp(law.lost) == 0.0:
         promises.append(SHARED_ROW)

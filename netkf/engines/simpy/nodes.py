@@ -315,8 +315,17 @@ class Node:
         y = np.concatenate([y for y, *_ in functions])
         stacked = Stacked([h for _, h, _ in functions])
         y, H, extra = linearise_by_points(stacked, y, xhat, root, self._points)
-        linear = [sample for sample in samples if isinstance(sample[1], np.ndarray)]
-        return [*linear, (y, H, block_diagonal([R for *_, R in functions]) + extra)]
+        is_linear = [isinstance(H, np.ndarray) for _, H, _ in samples]
+        parts = [sample for sample, linear in zip(samples, is_linear, strict=True) if linear]
+        parts.append((y, H, block_diagonal([R for *_, R in functions]) + extra))
+        if self._gate is not None:
+            return parts
+        # Rows in the order of the sensors again: filters may use them one by one.
+        first = np.repeat(is_linear, [len(R) for *_, R in samples])
+        order = np.argsort(np.argsort(~first, kind="stable"))
+        y, H = (np.concatenate([part[k] for part in parts])[order] for k in range(2))
+        R = block_diagonal([R for *_, R in parts])
+        return [(y, H, R[np.ix_(order, order)])]
 
     def gated(self, samples: Sequence[Sample], time: float, recorder: Recorder) -> Sequence[Sample]:
         """Return the linearised samples of this ``time`` that the gate lets pass, with the R that
