@@ -208,6 +208,16 @@ def test_networks_of_filters_are_the_same_in_both_engines(pair, kind):
         np.testing.assert_allclose(one.P, other.P, atol=1e-10)
 
 
+def test_rows_keep_the_order_of_the_sensors(pair):
+    """The bits of the one-bit filter are of one row after the other."""
+    scenario, _ = pair
+    near = {"kind": "range", "nodes": [0], "positions": ANCHORS[:1], "R": [[0.04]]}
+    straight = {"nodes": [0], "H": [[1.0, 0.0, 0.0]], "R": [[0.1]]}
+    changes = {"sensors": [near, straight, near], "filter": {"kind": "one-bit", "linearise": "ckf"}}
+    one, other = (netkf.simulate(scenario.replace(changes), engine=e) for e in ENGINES)
+    np.testing.assert_allclose(one.xhat, other.xhat, atol=1e-10)
+
+
 def sigma_points(x, P, method):
     """Points and weights of mean and covariance, as the papers have them."""
     n = len(x)
