@@ -110,6 +110,6 @@ def _losses_over_time(run: Run, outcomes: Outcomes, down: list[Downtime]) -> str
         for x, anchor, time in ((MARGIN, "start", "0 s"), (WIDTH, "end", f"{horizon:g} s"))
     )
     line = f'<rect x="{MARGIN}" y="{HEIGHT}" width="{WIDTH - MARGIN}" height="1"/>'
-    caption = f"Share of the messages lost, in parts of {horizon / WINDOWS:.3g} s"
+    caption = f"Share of the messages lost, in parts of {horizon / WINDOWS:.5g} s"
     caption += "; shaded: a node was down" if down else ""
     return _box(WIDTH, HEIGHT + 20, caption, "".join([*shades, *bars, axis, line, ends]))

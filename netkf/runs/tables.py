@@ -170,7 +170,7 @@ def _quantity_lines(summary: dict[str, Any]) -> Iterator[str]:
     shown = {
         "time_above": "error above the level in {:.2%} of the samples",
         "time_connected": "connected {:.1%} of the time",
-        "worst_age": "newest readings at most {:.4g} s old",
+        "worst_age": "newest readings at most {:.6g} s old",
         "joules": "{:,.4g} J",
     }
     parts = [text.format(row[key]) for key, text in shown.items() if row.get(key) is not None]
