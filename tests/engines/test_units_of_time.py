@@ -232,6 +232,17 @@ def test_engines_agree_in_slots(k):
     agree(slotted(1 / 12, options, steps, activation, 1))
 
 
+def test_a_tick_that_rounding_brings_to_the_horizon_is_none():
+    """Seven times 1/12 is less than 7/12 in floats; of nodes with lives and laws of losses in
+    Python the compiled engine counted such a tick in one place and not in another.
+    """
+    filter_, activation = CLOCKED[2][0], {"kind": "periodic", "at": "links", "period": 1}
+    lives = [{"kind": "duty", "nodes": [1], "period": 0.25, "up": 0.2}]
+    loss = {"kind": "shared", "delivery": 0.8, "share": 0.5}
+    changes = {"horizon": 7 / 12, "network.lives": lives, "network.channel.loss": loss}
+    agree(clocked(1 / 12, filter_, activation, FINE, NONE).replace(changes))
+
+
 def agree(scenario):
     simpy, compiled = (netkf.simulate(scenario, engine=e) for e in ("simpy", "compiled"))
     assert simpy.fingerprint == compiled.fingerprint

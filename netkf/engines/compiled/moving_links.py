@@ -41,17 +41,15 @@ def moving_links(
     """
     rows: list[Any] = []
     reach, owner = Reach(scenario, truth, rows.append), list[int]()
-    grid, horizon = scenario.time_grid, scenario.horizon
-    ticks = [grid.before(horizon, times) for times in listed]
-    count, samples = sum(map(len, ticks)), scenario.times[scenario.times < horizon]
-    t = np.concatenate([np.empty(0), *ticks, samples])
-    entity = np.repeat(np.arange(len(ticks) + 1), [*map(len, ticks), len(samples)])
+    count, samples = sum(map(len, listed)), scenario.times[scenario.times < scenario.horizon]
+    t = np.concatenate([np.empty(0), *listed, samples])
+    entity = np.repeat(np.arange(len(listed) + 1), [*map(len, listed), len(samples)])
     heard: list[list[bool]] = [[] for _ in senders.directions]
     # Nobody looks at a link neither of whose ends can send.
     index, ends = scenario.topology.index, 1 + (senders.at == "links")
     awake = [
         {node: iter((~is_down(index[node], times)).tolist()) for node in entity[:ends]}
-        for entity, times in zip(senders.entities, ticks, strict=True)
+        for entity, times in zip(senders.entities, listed, strict=True)
     ]
     distance: list[list[float]] = [[] for _ in senders.directions]
     follows, number = scenario.network.channel.loss.follows_distance, [0, 0]

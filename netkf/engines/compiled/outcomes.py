@@ -237,7 +237,7 @@ def list_outcomes(
         shared = _shared_draws(scenario, one, senders, of_run_ticks)
         waits = _waits(scenario, senders, of_run_ticks, moving and moving.heard)
         for e in range(entities):
-            times = scenario.time_grid.before(scenario.horizon, of_run_ticks[e])
+            times = of_run_ticks[e]
             draws, last = (np.empty(0), np.empty(0), np.empty(0)), -1
             for w in senders.outgoing[senders.first[e] : senders.first[e + 1]].tolist():
                 # Directions that share a stream share its draws.
@@ -267,7 +267,7 @@ def list_outcomes(
 
 
 def _transmissions(
-    scenario: Scenario, senders: Senders, ticks: Sequence[FloatArray]
+    senders: Senders, ticks: Sequence[FloatArray]
 ) -> Iterator[tuple[int, IntArray, FloatArray]]:
     """Yield each node, and by which entity and when it transmits, (K,) each, in order."""
     entities_of: dict[int, set[int]] = {}
@@ -275,7 +275,7 @@ def _transmissions(
         for w in senders.outgoing[senders.first[e] : senders.first[e + 1]].tolist():
             entities_of.setdefault(senders.directions[w][0], set()).add(e)
     for node, entities in entities_of.items():
-        times = [scenario.time_grid.before(scenario.horizon, ticks[e]) for e in sorted(entities)]
+        times = [ticks[e] for e in sorted(entities)]
         owner = np.repeat(sorted(entities), [len(of_one) for of_one in times])
         # By (time, entity).
         order = np.lexsort((owner, np.concatenate(times)))
@@ -289,7 +289,7 @@ def _shared_draws(
     broadcasts, shared = broadcasts_of(scenario, streams), {}
     if broadcasts is None:
         return {}
-    for node, owner, times in _transmissions(scenario, senders, ticks):
+    for node, owner, times in _transmissions(senders, ticks):
         drawn = broadcasts.draws(node, len(times))
         for e in np.unique(owner).tolist():
             own = owner == e
@@ -309,7 +309,7 @@ def _waits(
     if not scenario.messages_queue or scenario.network.radio is None:
         return found
     airtime = Airtime(scenario.network.radio)
-    for node, owner, times in _transmissions(scenario, senders, ticks):
+    for node, owner, times in _transmissions(senders, ticks):
         speaks = np.full(len(times), heard is None)
         for e in np.unique(owner).tolist():
             for w in senders.outgoing[senders.first[e] : senders.first[e + 1]].tolist():

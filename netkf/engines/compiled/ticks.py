@@ -355,15 +355,16 @@ def _list_ticks(
     senders: Senders,
     instants: Instants | None,
 ) -> list[FloatArray]:
-    """Return the times (K,) of all ticks of each entity of each run (R E), in seconds."""
+    """Return the instants (K,) of all ticks of each entity of each run (R E), in seconds."""
     clock = scenario.network.activation
     if senders.at == "readings":
         assert instants is not None
         return [instants.t[instants.index == node] for node in range(len(senders.entities))]
     if not isinstance(clock, LinkClock):
         return []
+    # A tick that rounding brings to the horizon is none: whatever counts ticks counts these.
     return [
-        ticks_of(scenario, one, entity)
+        scenario.time_grid.before(scenario.horizon, ticks_of(scenario, one, entity))
         for one in streams.per_replica
         for entity in senders.entities
     ]
