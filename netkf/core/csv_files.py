@@ -228,7 +228,7 @@ class _Entries:
             return source.node_ids[name]
         if not name and not may_miss:
             raise self._refusal(column, "must be the id or the name of a node", "correct the entry")
-        if not name or _is_number(name):
+        if not name or is_number(name):
             number = self.number(column, may_miss)
             if number < 0.0:
                 raise self._refusal(column, "must be an integer from 0 to 2^53", "correct it")
@@ -291,7 +291,7 @@ def _require_columns(source: SourceFile, sheet: _Sheet, required: tuple[str, ...
         remedy = f"write {missing[0]} for {alike[0]}"
     elif len(header) == 1 and missing[0] in _words(header[0]):
         remedy = "separate the columns by commas, semicolons or tabs"
-    elif all(map(_is_number, header)):
+    elif all(map(is_number, header)):
         remedy = "write the names of the columns in the first line"
     raise ScenarioError("path", rule, header, remedy)
 
@@ -302,7 +302,8 @@ def _words(text: str) -> list[str]:
     return text.split()
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str) -> bool:
+    """Return True for a number, with a decimal point or comma."""
     try:
         float(text.replace(",", "."))
     except ValueError:

@@ -253,7 +253,7 @@ def _find_columns(path: Path, raw: pd.DataFrame, notes: list[str]) -> dict[str, 
             )
     used = {name: column for name, column in names.items() if column}
     listed = ", ".join(f"{a} from {b}" if a != b else a for a, b in used.items())
-    unused = [column for column in raw.columns if column not in used.values()]
+    unused = [column for column in raw.columns if column and column not in used.values()]
     notes.append(
         f"used: {path.name}: {count_phrase(len(raw), 'row')}, columns {listed}"
         + (f"; not used: {', '.join(unused)}" if unused else "")
@@ -499,7 +499,7 @@ def _merge_rows(rows: pd.DataFrame, notes: list[str], log: str) -> pd.DataFrame:
         t = rows.groupby(key)["t"]
         apart = (t.max() - t.min()).max()
         told = f", up to {apart:g} s apart" if apart else ""
-        notes.append(f"merged: {count_phrase(repeated, 'row')} that repeat an outcome{told}")
+        notes.append(f"merged: {count_phrase(repeated, 'row')} of an outcome told before{told}")
     ordered = rows.sort_values(["send", "heard", "delay"], kind="stable", na_position="last")
     columns = ["send", "receiver", "heard", "delay", "rssi"]
     return ordered.drop_duplicates(key)[columns].reset_index(drop=True)

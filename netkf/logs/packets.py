@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from netkf.core.csv_files import open_table
+from netkf.core.csv_files import is_number, open_table
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import SourceFile
 from netkf.core.printable import count_phrase
@@ -92,6 +92,12 @@ def read_texts(path: Path) -> pd.DataFrame:
         if error.key != "path":
             raise
         raise ScenarioError(str(path), error.rule, error.value, error.remedy) from None
+    for wrong, rule, remedy in (
+        (len(header) == 1, "must have several columns", "separate them by comma, semicolon or tab"),
+        (all(map(is_number, header)), "must name its columns", "write their names in line 1"),
+    ):
+        if wrong:
+            raise ScenarioError(str(path), rule, header, remedy)
     for name in header:
         if header.count(name) > 1:
             raise ScenarioError(str(path), "must not repeat a column", name, "rename one of them")

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from netkf.core.csv_files import is_number
 from netkf.core.errors import ScenarioError
 from netkf.core.printable import count_phrase
 from netkf.core.stamps import TimeBase
@@ -153,7 +154,7 @@ def rename_nodes(log: PacketLog) -> None:
     if all(re.fullmatch(r"\d{1,15}", node) for node in nodes):
         names = {node: str(int(node)) for node in nodes}  # as tables write 01
     else:
-        names = {n: f"n{name}" if _is_number(name) else name for n, name in names.items()}
+        names = {n: f"n{name}" if is_number(name) else name for n, name in names.items()}
     if len(set(names.values())) < len(nodes):
         names = {node: f"n{k}" for k, node in enumerate(nodes)}
     changed = {a: b for a, b in names.items() if a != b}
@@ -166,14 +167,6 @@ def rename_nodes(log: PacketLog) -> None:
     for table in (log.positions, log.readings):
         if len(table):
             table["node"] = table["node"].replace(changed)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _outcome_tables(log: PacketLog, outcomes: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -203,7 +196,7 @@ def _own_scenario(
 ) -> Files:
     """Return a scenario with a plant and a filter to begin with, and the tables that it names."""
     sends, nodes = log.sends, sorted({*account["sender"], *account["receiver"]})
-    ids: list[Any] = [int(node) for node in nodes] if _is_number(nodes[0]) else nodes
+    ids: list[Any] = [int(node) for node in nodes] if is_number(nodes[0]) else nodes
     ids = sorted(ids)
     sends = _sends_of(log, set(nodes), "that nobody ever heard")
     directed = bool((sends["to"] != "").any())

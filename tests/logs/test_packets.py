@@ -135,7 +135,7 @@ def test_outcomes_events_and_repeated_rows(tmp_path, capsys):
     columns = ["receiver", "message", "delivered"]
     assert sorted(outcomes[columns].to_numpy().tolist()) == [[2, 0, 1], [3, 0, 0], [3, 1, 1]]
     assert table(tmp_path / "told", "accounts.csv")["unknown"].tolist() == [1, 0]
-    assert "merged: 1 row that repeat" in (tmp_path / "told" / "report.txt").read_text()
+    assert "merged: 1 row of an outcome told before" in (tmp_path / "told" / "report.txt").read_text()
     events = ["t,node,event,peer,seq", "1,1,tx,,0", "1.5,2,rx,1,0", "2,1,tx,,1", "2.5,3,rx,1,1"]
     netkf.import_log(write(tmp_path / "e.csv", events), "csv", tmp_path / "events")
     accounts = table(tmp_path / "events", "accounts.csv")
@@ -169,6 +169,8 @@ def test_outcomes_events_and_repeated_rows(tmp_path, capsys):
         (["t,src,dst", "1,2,2"], r"line 2: sender and receiver must differ"),
         (["t,src,dst", "1,,2"], r"line 2: must name a sender"),
         (["t,src,dst"], r"has no rows"),
+        (["t src dst", "1 1 2"], r"must have several columns.*separate them by comma"),
+        (["1,1,2", "2,2,1"], r"must name its columns"),
         (["t,src,dst,t_rx", "2,1,2,1"], r"line 2: is heard before it is sent"),
     ],
 )
@@ -306,7 +308,7 @@ def test_a_clock_that_begins_again_is_told(tmp_path):
     rows = ["t,src,dst,seq", "5,1,2,0", "6,1,2,1", "4.9,1,2,0"]
     _, notes = netkf.import_log(write(tmp_path / "log.csv", rows), "csv", tmp_path / "out")
     assert "sorted: stamps fall from row to row 1 time, by up to 1.1 s" in notes
-    assert "merged: 1 row that repeat an outcome, up to 0.1 s apart" in notes
+    assert "merged: 1 row of an outcome told before, up to 0.1 s apart" in notes
 
 
 def test_counters_begin_again():
