@@ -241,7 +241,9 @@ def _judge_node(
     scenario: Scenario, recorded: Innovations, chosen: np.ndarray, law: Law, level: float
 ) -> NodeInnovations:
     """Return the row of the node of ``chosen`` readings, with tests at ``level``."""
-    node = scenario.nodes[scenario.topology.index[int(recorded.nodes[chosen[0]])]]
+    # The central filter, -1, is no node of the network.
+    number = int(recorded.nodes[chosen[0]])
+    node = scenario.topology.named(number) if number >= 0 else number
     is_white = law.kind == "white"
     nis, rows = recorded.nis[chosen], recorded.rows[chosen]
     freedom, mean = float(rows.sum()), float(nis.sum() / rows.sum())
