@@ -371,7 +371,9 @@ def test_a_node_with_too_few_readings_does_not_hide_what_others_would_show(tmp_p
         assert shown.splitlines()[-1].startswith(last)
 
 
-@pytest.mark.parametrize(("kind", "linearise"), [("icf", "ukf"), ("diffusion", "ckf")])
+@pytest.mark.parametrize(
+    ("kind", "linearise"), [("icf", "ukf"), ("diffusion", "ckf"), ("central", "ekf")]
+)
 def test_a_replay_has_the_sigma_points_of_the_run(tmp_path, kind, linearise):
     """Nodes that start at one place: the sign of a rounding error decides on a direction."""
     text = CURVED.format(fault="", filter=kind, estimates="all").replace("lives", "# lives")
@@ -381,4 +383,6 @@ def test_a_replay_has_the_sigma_points_of_the_run(tmp_path, kind, linearise):
     path.write_text(text.replace("nodes = [0, 1]\nperiod", "nodes = [0, 1, 2, 3]\nperiod"))
     changes = {"filter.linearise": linearise, "filter.gate": {"probability": 0.9}, "seed": 1}
     run = netkf.simulate(netkf.load(path).replace(changes), engine="simpy")
-    assert [row.node for row in netkf.innovations(run).rows] == [0, 1, 2, 3]
+    # The central filter is no node of the network.
+    nodes = [-1] if kind == "central" else [0, 1, 2, 3]
+    assert [row.node for row in netkf.innovations(run).rows] == nodes
