@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from netkf.core.errors import ScenarioError
-from netkf.core.printable import shorten
+from netkf.core.printable import list_some, shorten
 from netkf.figures.figure_data import FigureData, reduce_result
 from netkf.figures.names import SERIES
 from netkf.figures.style import (
@@ -62,11 +62,13 @@ def errors_figure(curves: Sequence[ErrorCurve], origin: str = "") -> Picture:
         sentences = [origin, "Mean over all nodes."]
         if any(curve.se is not None for curve in known):
             sentences.append("Bands: 95% intervals of the means over runs, or wider.")
+        if len(known) > 1 and any(curve.se is None for curve in known):
+            sentences.append("Differences of single runs may be chance.")
         if len(known) > MAX_CURVES:
             sentences.append(f"The first {MAX_CURVES} of {len(known)}.")
         missing = [shorten(c.label, MAX_LABEL) for c in curves if c not in known]
         if missing:
-            sentences.append(f"Without errors: {', '.join(missing)}.")
+            sentences.append(f"Without errors: {list_some(missing, 6)}.")
         finish_figure(figure, _headline(known), [" ".join(filter(None, sentences))])
     return figure
 
@@ -112,15 +114,16 @@ def _high(curve: ErrorCurve) -> FloatArray:
 
 
 def _headline(curves: Sequence[ErrorCurve]) -> str:
-    means = []
+    means, ends = [], {float(curve.times[-1]) for curve in curves}
+    when = "after time 0" if len(ends) == 1 else f"up to {min(ends):g} s"
     for curve in curves:
-        after = curve.square[curve.times > 0.0]
+        after = curve.square[(curve.times > 0.0) & (curve.times <= min(ends))]
         mean = float(after.mean()) if len(after) else math.nan  # nan where a run diverged
         means.append((mean if math.isfinite(mean) else math.inf, shorten(curve.label, MAX_LABEL)))
     (best, name), (worst, last) = min(means), max(means)
     if not math.isfinite(best):
         return "Mean square errors over time"
-    sentence = f"{name} has the smallest mean square error after time 0, {best:.3g}"
+    sentence = f"{name} has the smallest mean square error {when}, {best:.3g}"
     if len(means) == 1:
         return f"{name}: mean square error {best:.3g} after time 0"
     return f"{sentence}; {last} {worst:.3g}" if math.isfinite(worst) else sentence

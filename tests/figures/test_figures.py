@@ -12,7 +12,9 @@ from netkf.cli.main import main
 from netkf.figures import plane
 from netkf.figures.catalogue import FIGURES, FigureSet, plot_to_files
 from netkf.figures.names import FIGURE_NAMES
+from netkf.figures.several import errors_figure
 from netkf.figures.style import style_context
+from netkf.runs.curves import ErrorCurve
 from tests.conftest import SCENARIOS, with_slow
 from tests.figures.conftest import KINDS
 
@@ -229,9 +231,17 @@ def test_errors_of_several_results_are_drawn_in_one_figure(results, tmp_path, ca
         line.get_ydata() for line in figure.axes[0].lines if len(line.get_xdata()) == len(bound)
     ]
     assert any(np.allclose(line, bound, rtol=1e-9) for line in drawn)
-    averages = {"one $run$": squares[1:].mean(), "many": means[1:].mean()}
+    both = min(run.times[-1], ensemble.times[-1])  # they are compared over the time of both
+    later = [(result.times > 0.0) & (result.times <= both) for result in (run, ensemble)]
+    averages = {"one $run$": squares[later[0]].mean(), "many": means[later[1]].mean()}
     best = min(averages, key=averages.get).replace("$", r"\$")
     assert figure.get_suptitle().startswith(f"{best} has the smallest mean square error")
+    # Runs of different lengths are compared over the time that all have.
+    half = len(run.times) // 2
+    short = ErrorCurve("short", run.times[: half + 1], squares[: half + 1])
+    longer = ErrorCurve("long", run.times, np.where(np.arange(len(squares)) > half, 1e9, 0.0))
+    title = errors_figure([short, longer]).get_suptitle().replace("\n", " ")
+    assert title.startswith(f"long has the smallest mean square error up to {run.times[half]:g} s")
     assert_well_laid_out(netkf.plot([run, results("no truth"), run] * 10))
     with pytest.raises(netkf.ScenarioError, match="its figures are error"):
         netkf.plot([run, ensemble], "nees")
