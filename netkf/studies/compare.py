@@ -270,6 +270,8 @@ class Comparison(NotebookTable):
             found.append("the plants differ, and so the states whose errors these are")
         elif keys and {*keys} <= {"seed", "replica"}:
             found.append("only the draws differ: these are runs of one scenario")
+        if "horizon" in keys:
+            found.append("the horizons differ, and so the times over which these are means")
         return found
 
     @property

@@ -505,12 +505,13 @@ def test_states_have_their_names_and_units_on_pages_and_figures(ring, tmp_path):
     assert re.search(r"trace P is \S+ m\^2, which claims an RMS error of \S+ m; its error", told)
     compared = netkf.compare([tmp_path / "metres", tmp_path / "metres"])
     assert compared.remarks() == ["errors are in m, traces of P in m^2"]
-    names = {"plant.units": ["km", "km"], "horizon": 2.0, "plant.A": [[0.0, 1.0], [-2.0, 0.1]]}
+    names = {"plant.units": ["km", "km"], "horizon": 1.5, "plant.A": [[0.0, 1.0], [-2.0, 0.1]]}
     other = netkf.load(SCENARIOS / "poisson_ring.toml", names)
     netkf.save(netkf.simulate(other, engine="simpy"), other, tmp_path / "kilometres")
     remarks = netkf.compare([tmp_path / "metres", tmp_path / "kilometres"]).remarks()
     assert remarks[0] == "errors are in m, km: they do not compare"
     assert remarks[1].startswith("the plants differ")
+    assert remarks[2].startswith("the horizons differ")
     for key, value in (("states", ["x"]), ("states", ["x", "x"]), ("units", ["m"] * 3)):
         with pytest.raises(ScenarioError, match=f"plant.{key}"):
             scenario.replace({f"plant.{key}": value})
