@@ -6,6 +6,7 @@ from netkf.algorithms.filter import Filter
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import walk
 from netkf.network.clocks import LinkClock
+from netkf.network.contacts import Contacts
 from netkf.network.matchings import SlotActivation
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.model import takes_samples
@@ -60,6 +61,8 @@ def check_activation(scenario: DerivedScenario) -> None:
     if clock.at not in node_filter.timing.clocks:
         clocks, at = node_filter.timing.clocks, clock.at
         settings = [f'at = "{one}"' for one in clocks if one != "readings"]
+        if isinstance(clock, Contacts) and "nodes" in clocks:
+            settings[settings.index('at = "nodes"')] += " of another kind than contacts"
         settings += ['kind = "readings"'] if "readings" in clocks else []
         key = "kind" if at == "readings" else "at"
         rule, remedy = f"must be one that the {name} runs under", "write that, or change the filter"

@@ -90,7 +90,9 @@ def _check_blocks(scenario: DerivedScenario) -> None:
         pieces = () if closed else scenario.believed_pieces
         if any(M[np.ix_(view, others)].any() for M, _ in pieces):
             rule = f"must contain all that drives the blocks of node {node}"
-            remedy = 'write kind = "partition", or estimate the coupled blocks too, as "all" does'
+            remedy = 'write kind = "partition"'
+            if not scenario.node_filter.needs.own_blocks:
+                remedy += ', or estimate the coupled blocks too, as "all" does'
             raise ScenarioError("filter.estimates", rule, scenario.filter.estimates, remedy)
         for placed in scenario.placed_sensors.get(node, ()):
             support = scenario.support(placed)
@@ -99,20 +101,30 @@ def _check_blocks(scenario: DerivedScenario) -> None:
             key = scenario.sensor_key(placed.entry)
             if not knows_blocks or not np.isin(support, view).any():
                 rule = f"must read blocks that node {node} estimates, for the {name}"
-                listed = ", ".join(f'"{name}"' for name in scenario.layout.names)
-                elsewhere = any(
-                    place.node not in (None, node)
-                    and any(place.first <= entry < place.first + place.n for entry in support)
-                    for place in scenario.layout.places
-                )
-                choice = '"own+neighbours"' if elsewhere else f"[{listed}]"
-                remedy = f'write filter.estimates = {choice} or "all"'
+                remedy = _wider_estimates(scenario)
                 raise ScenarioError(key, rule, scenario.filter.estimates, remedy)
             sensor = scenario.sensors[placed.entry]
             _check_rows(scenario, k, key, sensor)
             if not (scenario.slotted or takes_samples(sensor)):
                 rule = "is missing: increments of two blocks need both estimates"
                 raise ScenarioError(f"{key}.sampling", rule, None, f"add {SAMPLING}")
+
+
+def _wider_estimates(scenario: DerivedScenario) -> str:
+    """Return with which estimates all sensors read blocks that their nodes estimate."""
+    needs, topology, places = scenario.node_filter.needs, scenario.topology, scenario.layout.places
+    if needs.own_blocks:
+        return 'read blocks of the node itself, or write kind = "diffusion", estimates = "all"'
+    listed = ", ".join(f'"{name}"' for name in scenario.layout.names)
+    fitting = dict.fromkeys([f"[{listed}]", '"own+neighbours"'], True)
+    for node, sensors in scenario.placed_sensors.items():
+        linked: set[int | None] = {*topology.senders(node), *topology.receivers(node)}
+        for support in map(scenario.support, sensors):
+            read = {p.node for p in places if np.isin(support, np.r_[p.entries]).any()}
+            for choice, nodes in zip(fitting, ({node, None}, {node, *linked}), strict=True):
+                fitting[choice] &= bool(read & nodes) if needs.blocks else read <= nodes
+    choices = [choice for choice in fitting if fitting[choice]][:1]
+    return "write filter.estimates = " + " or ".join([*choices, '"all"'])
 
 
 def _check_rows(scenario: DerivedScenario, k: int, key: str, sensor: Any) -> None:

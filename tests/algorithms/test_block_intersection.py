@@ -281,6 +281,15 @@ def test_shared_blocks_are_estimated_by_any_filter(tmp_path: Path) -> None:
     text = text[:begin] + text[end:]
     with pytest.raises(netkf.ScenarioError, match=r'estimates = \["pose", "target"\] or "all"'):
         load(text, tmp_path, filter={"kind": "block-intersection", "estimates": "own"})
+    one_each = {"kind": "block-cross-covariances", "estimates": "own"}
+    with pytest.raises(
+        netkf.ScenarioError, match=r'or write kind = "diffusion", estimates = "all"'
+    ):
+        load(text, tmp_path, filter=one_each)
+    # What is advised helps: the neighbours' blocks are not the shared one.
+    near = {"kind": "local", "estimates": "own+neighbours"}
+    with pytest.raises(netkf.ScenarioError, match=r'write filter.estimates = \["pose", "target"\]'):
+        load(text, tmp_path, filter=near)
     shared = {"filter": {"kind": "kcf", "estimates": "shared"}}
     run = netkf.simulate(load(text, tmp_path, **shared))
     alone = text[: text.index("[[plants]]")] + text[text.index(target) :]

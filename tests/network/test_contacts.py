@@ -210,3 +210,10 @@ def test_mistakes_are_named(name, make, tmp_path):
     changes = {"kind": "contacts", "path": "contacts.csv", "clock": CLOCKS["periodic"], **more}
     with pytest.raises(netkf.ScenarioError, match=words):
         contacts.replace({"network.activation": changes})
+
+
+def test_a_filter_of_nodes_is_sent_to_another_kind(make):
+    _, contacts = make(CLOCKS["poisson"])
+    words = 'at = "directions" or at = "nodes" of another kind than contacts or'
+    with pytest.raises(netkf.ScenarioError, match=words):
+        contacts.replace({"filter": {"kind": "diffusion"}})
