@@ -58,7 +58,7 @@ def from_control(
         raise ScenarioError("system", "must be a state space", type(system).__name__, remedy)
     A, C = (matrix(name, np.asarray(getattr(space, name))) for name in "AC")
     gain = np.eye(len(A)) if G is None else _shaped("G", matrix("G", np.atleast_2d(G)), len(A))
-    hint = "correct it" + ", or give G = system.B for noise at the inputs" * (G is None)
+    hint = "correct it" + ", or give G = system.B for noise at the inputs" * (G is None and known)
     noise = _shaped("Q", covariance("Q", np.atleast_2d(Q)), gain.shape[1], hint)
     named = str(getattr(system, "name", None) or "")
     table: dict[str, Any] = {"name": named if named and "[" not in named else "system"}

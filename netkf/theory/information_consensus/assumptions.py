@@ -37,7 +37,8 @@ def _judge_counts(scenario: Scenario) -> tuple[bool, str]:
     lossless = in_time and nothing_is_lost(scenario)
     # A node that hears nothing counts its own reading in full, whatever the weights.
     max_count = float(reading_counts(scenario, steps if lossless else 0).max())
-    evidence = f"a node counts a reading up to {max_count:.4g} times"
+    often = f"{max_count:.4g} times"
+    evidence = f"a node counts a reading {'once' if often == '1 times' else f'up to {often}'}"
     if not lossless:
         evidence += ": its own, in slots in which it hears nothing"
     return max_count <= 1.0 + TOLERANCE, evidence
