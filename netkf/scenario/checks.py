@@ -300,9 +300,15 @@ def _check_faults(scenario: DerivedScenario) -> None:
         fault, key = sensor.fault, f"{scenario.sensor_key(k)}.fault"
         if fault is None:
             continue
-        declared = scenario.declared_sensors[scenario.sensor_entries[k]]
+        entry = scenario.sensor_entries[k]
+        # One that says no nodes has those that read something.
+        nodes = scenario.declared_sensors[entry].nodes or {
+            node
+            for other, of in zip(scenario.sensors, scenario.sensor_entries, strict=True)
+            for node in (other.nodes if of == entry else ())
+        }
         for place, node in enumerate(fault.nodes or ()):
-            if node not in declared.nodes:
+            if node not in nodes:
                 rule = "must be a node of this sensor"
                 raise ScenarioError(f"{key}.nodes[{place}]", rule, node, "remove it")
         if sensor.record is not None or not (scenario.slotted or takes_samples(sensor)):

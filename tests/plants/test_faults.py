@@ -163,6 +163,64 @@ def test_curved_and_relative_readings_are_given_alike_by_both_engines(tmp_path, 
     assert abs(compiled.xhat - healthy.xhat).max() > 1e-3
 
 
+RELATIVE = """
+format = 1
+name = "bad-differences"
+horizon = 8.0
+probe = 0.5
+[[plants]]
+name = "pose"
+nodes = [0, 1, 2]
+{plant}
+mean = [1.0, 2.0]
+cov = [[0.5, 0.0], [0.0, 0.5]]
+[[sensors]]
+of = "pose"
+nodes = [0, 1]
+H = [[1.0, 0.0]]
+R = [[0.2]]
+{sampling}
+[[sensors]]
+kind = "relative"
+of = "pose"
+H = [[1.0, 0.5], [0.0, 1.0]]
+R = [[0.2, 0.1], [0.1, 0.3]]
+{sampling}
+{fault}
+[network]
+graph = {{ kind = "path", nodes = 3 }}
+activation = {{ kind = "{activation}" }}
+[filter]
+kind = "{filter}"
+"""
+TIMES = {
+    "slots": (
+        'kind = "linear"\nperiod = 0.5\nF = [[0.9, 0.1], [0.0, 0.8]]\nQ = [[0.1, 0.0], [0.0, 0.1]]',
+        "broadcast",
+    ),
+    "clocks": (
+        'kind = "diffusion"\nA = [[-0.1, 0.1], [0.0, -0.3]]\nB = [[0.3, 0.0], [0.0, 0.3]]',
+        "readings",
+    ),
+}
+
+
+@pytest.mark.parametrize("time", TIMES)
+@pytest.mark.parametrize("filter", ["block-intersection", "partition"])
+def test_differences_of_blocks_are_bad_alike_in_both_engines(tmp_path, time, filter):
+    sampling = 'sampling = { kind = "periodic", period = 0.5 }' * (time == "clocks")
+    values = dict(zip(("plant", "activation"), TIMES[time], strict=True))
+    for fault in FAULTS.values():
+        text = RELATIVE.format(fault=fault, sampling=sampling, filter=filter, **values)
+        (tmp_path / "differences.toml").write_text(text)
+        scenario = netkf.load(tmp_path / "differences.toml")
+        simpy, compiled = (netkf.simulate(scenario, engine=name) for name in ("simpy", "compiled"))
+        assert simpy.fingerprint == compiled.fingerprint
+        np.testing.assert_allclose(compiled.xhat, simpy.xhat, rtol=1e-9, atol=1e-9)
+        healthy = netkf.simulate(scenario.replace({"sensors.1.fault": None}), engine="compiled")
+        assert abs(compiled.xhat - healthy.xhat).max() > 1e-3
+
+
 OWN = """
 from dataclasses import dataclass
 import numpy as np

@@ -215,4 +215,4 @@ def _reads_in_its_own_way(
         read = [frozenset(block[outside & (row != 0.0)].tolist()) for row in H]
         if len(set(read)) > 1:
             return True
-    return is_own(sensor)
+    return is_own(sensor) and sensor.fault is None

@@ -662,7 +662,8 @@ class SlotRuns:
             for run, path in enumerate(paths):
                 b, lane = divmod(run, LANES)
                 read, of_all = read_whitened(path, slots, x[b, times.sensed, :, lane], s.R, s.root)
-                own = read, setup.columns.of(s.estimator, of_all)
+                place = setup.pairs.all[s.pair].place if setup.pairs and s.pair >= 0 else None
+                own = read, setup.columns.of(s.estimator, of_all, place)
                 for out, values in zip((y, H), own, strict=True):
                     out[b, times.sensed, s.estimator, rows, ..., lane] = values
         for s, path in self._recorded:
