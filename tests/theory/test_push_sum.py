@@ -385,7 +385,7 @@ def test_rho_of_the_planar_network():
                     "mean_burst": 4.0,
                 }
             },
-            "GilbertElliott",
+            "gilbert-elliott",
         ),
         ({"network.channel.delay": {"kind": "exponential", "mean": 0.1}}, "shorter delay"),
         ({"filter": {"kind": "central"}}, "push-sum filter"),
