@@ -7,6 +7,7 @@ grey.
 
 from __future__ import annotations
 
+import bisect
 import contextlib
 import io
 from collections.abc import Iterator, Sequence
@@ -117,15 +118,20 @@ def break_lines(text: str, width: float, size: float, weight: str = "normal") ->
     """Return a text in lines of at most ``width`` points in a font of ``size`` points, without
     control characters, and with escaped dollar signs, which matplotlib takes for formulas.
     """
-    lines = [""]
-    for word in one_line(text).split():
-        longer = f"{lines[-1]} {word}".strip()
-        if lines[-1] and text_width(longer, size, weight) > width:
-            lines.append(word)
-        else:
-            lines[-1] = longer
-    pieces = [piece for line in lines for piece in _split_word(line, width, size, weight)]
+    words, pieces = one_line(text).split(), list[str]()
+    while words:
+        count = _count_fitting(words, width, size, weight)
+        pieces += _split_word(" ".join(words[:count]), width, size, weight)
+        words = words[count:]
     return "\n".join(pieces).replace("$", r"\$")
+
+
+def _count_fitting(words: list[str], width: float, size: float, weight: str) -> int:
+    """Return how many of the ``words`` one line takes, at least 1."""
+    more = range(2, len(words) + 1)
+    return 1 + bisect.bisect_right(
+        more, width, key=lambda count: text_width(" ".join(words[:count]), size, weight)
+    )
 
 
 def _split_word(line: str, width: float, size: float, weight: str) -> list[str]:

@@ -31,7 +31,7 @@ from netkf.figures.style import (
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.connectivity import newest_heard, sent_at
 from netkf.trace.messages import DELIVERED, UNDER_WAY, by_link
-from netkf.trace.schema import CODES
+from netkf.trace.schema import rows_of
 
 AGE_BINS = 160  # of time, for means and maxima of the age
 AGE_LEVELS = 400  # levels at which the distribution of ages is drawn
@@ -90,9 +90,11 @@ def _sum_excess(values: FloatArray, levels: FloatArray) -> FloatArray:
     return np.asarray(sums[above] - above * levels)
 
 
-def age_of_information(log: np.ndarray, node: int, end: float) -> AgeSawtooth:
-    """Return the time since the newest arrived message was sent, until ``end`` (s)."""
-    arrivals = log[(log["kind"] == CODES["deliver"]) & (log["node"] == node) & (log["t"] < end)]
+def age_of_information(heard: np.ndarray, node: int, end: float) -> AgeSawtooth:
+    """Return the time since the newest arrived message was sent, until ``end`` (s), from the EVENT
+    rows of messages ``heard`` (K,) by all nodes.
+    """
+    arrivals = np.take(heard, np.flatnonzero((heard["node"] == node) & (heard["t"] < end)))
     start = np.concatenate([[0.0], arrivals["t"]])
     stop = np.concatenate([arrivals["t"], [end]])
     return AgeSawtooth(start, stop, start - newest_heard(start[1:], sent_at(arrivals), start))
@@ -105,7 +107,8 @@ def age_figure(data: FigureData) -> Picture:
     receivers = [node for node in data.nodes if degrees.get(node, 0)]
     if not receivers:
         raise UnavailableError("No node can hear another one.")
-    ages = [age_of_information(data.log, node, end) for node in receivers]
+    heard = rows_of(data.log, "deliver")
+    ages = [age_of_information(heard, node, end) for node in receivers]
     means = np.array([float(age.mean(np.array([0.0, end]))[0]) for age in ages])
     figure = new_figure(8.4, 4.2)
     left, right = figure.subplots(1, 2, width_ratios=[1.6, 1.0])

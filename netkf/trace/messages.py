@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
 
+from netkf.linalg.arrays import IntArray
 from netkf.trace.schema import CODES
 
 DELIVERED, LOST, LATE, UNDER_WAY = range(4)
@@ -40,14 +42,14 @@ def join_messages(log: np.ndarray) -> np.ndarray:
     event.
     """
     rows = np.flatnonzero(np.isin(log["kind"], [CODES["send"], *OUTCOMES]))
-    events = log[rows]
+    events = np.take(log, rows)
     ended = events["kind"] != CODES["send"]
     # A loss is an event of the sender, an arrival one of the receiver.
     of_sender = ~ended | (events["kind"] == CODES["lost"])
     sender = np.where(of_sender, events["node"], events["peer"])
     receiver = np.where(of_sender, events["peer"], events["node"])
-    order = np.lexsort((ended, events["message"], receiver, sender))
-    events, rows, ended = events[order], rows[order], ended[order]
+    order = _order_by(sender, receiver, events["message"], ended)
+    events, rows, ended = np.take(events, order), rows[order], ended[order]
     sends = np.flatnonzero(~ended)
     messages = np.zeros(len(sends), dtype=MESSAGE)
     columns = {"sender": sender[order], "receiver": receiver[order], "number": events["message"]}
@@ -70,6 +72,18 @@ def join_messages(log: np.ndarray) -> np.ndarray:
         messages["outcome"][k[events["kind"][ends] == code]] = outcome
     messages["end_row"][k] = rows[ends]
     return messages
+
+
+def _order_by(*keys: np.ndarray) -> IntArray:
+    """Return the order (K,) of rows by integer ``keys`` (K,), the first one first."""
+    sizes = [int(key.max(initial=0)) + 1 for key in keys]
+    if math.prod(sizes) >= 1 << 62 or min(int(key.min(initial=0)) for key in keys) < 0:
+        return np.lexsort(keys[::-1])
+    # As one number they are sorted once, not key by key.
+    number = np.zeros(len(keys[0]), dtype=np.int64)
+    for key, size in zip(keys, sizes, strict=True):
+        number = number * size + key
+    return np.argsort(number, kind="stable")
 
 
 def by_link(messages: np.ndarray) -> Iterator[np.ndarray]:
