@@ -90,11 +90,11 @@ def _sum_excess(values: FloatArray, levels: FloatArray) -> FloatArray:
     return np.asarray(sums[above] - above * levels)
 
 
-def age_of_information(heard: np.ndarray, node: int, end: float) -> AgeSawtooth:
+def age_of_information(arrived: np.ndarray, node: int, end: float) -> AgeSawtooth:
     """Return the time since the newest arrived message was sent, until ``end`` (s), from the EVENT
-    rows of messages ``heard`` (K,) by all nodes.
+    rows of messages that have ``arrived`` (K,).
     """
-    arrivals = np.take(heard, np.flatnonzero((heard["node"] == node) & (heard["t"] < end)))
+    arrivals = np.take(arrived, np.flatnonzero((arrived["node"] == node) & (arrived["t"] < end)))
     start = np.concatenate([[0.0], arrivals["t"]])
     stop = np.concatenate([arrivals["t"], [end]])
     return AgeSawtooth(start, stop, start - newest_heard(start[1:], sent_at(arrivals), start))
@@ -107,8 +107,8 @@ def age_figure(data: FigureData) -> Picture:
     receivers = [node for node in data.nodes if degrees.get(node, 0)]
     if not receivers:
         raise UnavailableError("No node can hear another one.")
-    heard = rows_of(data.log, "deliver")
-    ages = [age_of_information(heard, node, end) for node in receivers]
+    arrived = rows_of(data.log, "deliver")
+    ages = [age_of_information(arrived, node, end) for node in receivers]
     means = np.array([float(age.mean(np.array([0.0, end]))[0]) for age in ages])
     figure = new_figure(8.4, 4.2)
     left, right = figure.subplots(1, 2, width_ratios=[1.6, 1.0])

@@ -13,6 +13,7 @@ from netkf.figures.panels import MAX_FREEDOM, nees_interval
 from netkf.figures.traffic import age_of_information, heard, messages_by_direction, wilson_interval
 from netkf.studies.consistency import run_consistency
 from netkf.trace.messages import join_messages
+from netkf.trace.schema import rows_of
 from tests.conftest import SCENARIOS
 from tests.figures.conftest import one_node
 
@@ -30,7 +31,7 @@ def test_the_age_of_information_is_that_of_a_plain_loop(results, kind):
         for e in heard.itertuples():
             newest[fine >= e.t] = np.maximum(newest[fine >= e.t], e.t - np.nan_to_num(e.age))
         expected = fine - newest
-        found = age_of_information(run.log, node, end)
+        found = age_of_information(rows_of(run.log, "deliver"), node, end)
         edges = np.linspace(0.0, end, 9)
         parts = np.split(expected, 8)
         step = 2.0 * end / len(fine)
