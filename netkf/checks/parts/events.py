@@ -18,6 +18,7 @@ from netkf.laws.ticks import ClockGroup, TickCounts, count_by_window, count_tick
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.network.clocks import LinkClock
 from netkf.network.contacts import Contacts
+from netkf.network.losses import stated_delivery
 from netkf.network.matchings import Matching
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
@@ -157,9 +158,8 @@ def loss_law(scenario: Scenario) -> LossLaw:
     opposite = _places(links, [receivers, senders])
     hops = None
     if channel.channels is not None:
+        alone = [stated_delivery(loss, scenario.transmission(link)) for link in links]
         on_hops = [channel.channels.on_hops(link) for link in links]
-        once = dataclasses.replace(stated, channels=None)
-        alone = [once.mean_delivery(scenario.transmission(link)) for link in links]
         hops = 1.0 - np.array(alone)[:, None] * np.array(on_hops)
     # Broadcasts of two nodes at different times would both step a chain that they share.
     one_step = isinstance(clock, Matching) or (

@@ -13,7 +13,7 @@ from netkf.algorithms.kernels.run import ALIKE
 from netkf.algorithms.translation import read_vector
 from netkf.core.places import Place
 from netkf.engines.compiled.nonlinear_rows import NonlinearSetup, has_known_h
-from netkf.engines.compiled.own_sensors import is_own
+from netkf.engines.compiled.own_sensors import reads_as_built_in
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.scenario.model import PlacedSensor
 from netkf.scenario.scenario import Scenario
@@ -215,4 +215,4 @@ def _reads_in_its_own_way(
         read = [frozenset(block[outside & (row != 0.0)].tolist()) for row in H]
         if len(set(read)) > 1:
             return True
-    return is_own(sensor) and sensor.fault is None
+    return not reads_as_built_in(sensor)

@@ -659,10 +659,10 @@ class SlotRuns:
         for s, paths in self._own:
             rows = slice(s.row, s.row + s.rows)
             y[:, times.sensed, s.estimator, rows] = 0.0  # in lanes without a run
+            place = setup.block_beside(s)
             for run, path in enumerate(paths):
                 b, lane = divmod(run, LANES)
                 read, of_all = read_whitened(path, slots, x[b, times.sensed, :, lane], s.R, s.root)
-                place = setup.pairs.all[s.pair].place if setup.pairs and s.pair >= 0 else None
                 own = read, setup.columns.of(s.estimator, of_all, place)
                 for out, values in zip((y, H), own, strict=True):
                     out[b, times.sensed, s.estimator, rows, ..., lane] = values

@@ -14,6 +14,7 @@ from netkf.algorithms.gates import Gate
 from netkf.algorithms.kernels.run import opposite_links
 from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.models import SlotModel, first_roots
+from netkf.core.places import Place
 from netkf.engines.compiled.nonlinear_rows import NonlinearSetup
 from netkf.engines.compiled.outcomes import delivery_table
 from netkf.engines.compiled.own_sensors import is_own
@@ -212,6 +213,10 @@ class SlotSetup:
         self.assigned, self.p = assigned, int(ends.max(initial=1))
         return rows
 
+    def block_beside(self, s: AssignedSensor) -> Place | None:
+        """Return the block that a sensor reads beside those of its filter, if it is drawn."""
+        return self.pairs.all[s.pair].place if self.pairs and s.pair >= 0 else None
+
     def _set_nonlinear_rows(self, scenario: Scenario) -> None:
         self.nonlinear: NonlinearSetup | None = None
         if not self.nonlinear_sensors:
@@ -257,7 +262,7 @@ class SlotSetup:
                 regressor_index[m], H[m, 0, 0] = self.regressor_sensors.index(s), 1.0 / s.root[0, 0]
                 continue
             H[m, :rows] = solve_lower(s.root, sensor.H)
-            place = self.pairs.all[s.pair].place if self.pairs and s.pair >= 0 else None
+            place = self.block_beside(s)
             own = self.columns.of(s.estimator, H[m, :rows], place)
             self.H[0, 0, s.estimator, s.row : s.row + rows] = own[..., None]
         regressors: list[Any] = [
