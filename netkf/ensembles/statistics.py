@@ -236,10 +236,8 @@ def _quantities(
     for first, end in sorted(set(zip(spans[:, 0].tolist(), ends.tolist(), strict=True))):
         runs = (spans[:, 0] == first) & (ends == end)
         part = squares[:, first:end] if runs.all() else squares[runs, first:end]
-        values = sample_quantities(scenario, part)
-        if copies > 1:
-            values = np.repeat(values[:, -1:], len(scenario.nodes) + 1, axis=1)
-        found[runs] = values
+        # A quantile of all nodes is between samples of all, though one filter stands for them.
+        found[runs] = sample_quantities(scenario, np.repeat(part, copies, axis=2))
     return found if network is None else np.concatenate([found, network], axis=2)
 
 

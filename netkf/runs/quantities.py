@@ -156,11 +156,18 @@ def _joules(energy: Energy, size: float, frames: int) -> float:
     return energy.joules_per_packet * frames + energy.joules_per_byte * size
 
 
+def has_ages(scenario: Scenario) -> bool:
+    """Return True if nodes can hear of the readings of others, whose ages runs then have."""
+    timing = scenario.node_filter.timing
+    alone = len(scenario.nodes) < 2 or not scenario.sensing_nodes
+    return timing.talks and not timing.pooled and not alone
+
+
 def _make_ages(scenario: Scenario) -> Ages | None:
     """Return the ages of a run; None if nodes do not talk or nobody asks for those of so many."""
-    sources, timing = scenario.sensing_nodes, scenario.node_filter.timing
+    sources = scenario.sensing_nodes
     asked = scenario.metrics.network or len(scenario.nodes) * len(sources) <= MAX_PAIRS
-    if not sources or not timing.talks or timing.pooled or not asked:
+    if not asked or not has_ages(scenario):
         return None
     return Ages(
         scenario.nodes,

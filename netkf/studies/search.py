@@ -265,8 +265,14 @@ class Search:
             )
             simulated += batch
             joined = join_metrics(*metrics)
-            names = ensemble_names(scenario)
-            interval = quantity_by_simulation(joined, target, plan.level, central, names)
+            interval = quantity_by_simulation(
+                joined,
+                target,
+                plan.level,
+                central,
+                ensemble_names(scenario),
+                target.has_rare_runs(scenario),
+            )
             state = target.decide(interval)
             say(
                 f"{self.key} = {value:g}: {target.quantity} {interval.value:.4g}, between "

@@ -13,7 +13,8 @@ import scipy
 
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.linalg.arrays import FloatArray
-from netkf.runs.quantities import NETWORK
+from netkf.network.lives import DutyCycle, RecordedLife
+from netkf.runs.quantities import NETWORK, has_ages
 from netkf.scenario.scenario import Scenario
 from netkf.studies.metrics import RunMetrics, bound_traces, central_traces, over_central
 from netkf.theory import assumptions
@@ -40,6 +41,10 @@ QUANTITIES = AVERAGES | {
     "joules": "joules spent by all nodes in a run",
 }
 """Quantities of a target, beside quantile_99 and its kind."""
+UNSEEN = 2
+"""Runs added at either end of a share: of rare ones, unlike all others, none may have come yet
+(Agresti and Coull, The American Statistician 52, 1998).
+"""
 QUANTILE = re.compile(r"quantile_(\d+(?:\.\d+)?)")
 
 
@@ -79,6 +84,11 @@ class Target(NamedTuple):
             return f"error that is not exceeded in {quantile[1]} % of samples"
         return QUANTITIES[self.quantity]
 
+    def has_rare_runs(self, scenario: Scenario) -> bool:
+        """Return True if it is a share that few runs may have another value of than all others."""
+        planned = all(isinstance(k, DutyCycle | RecordedLife) for k in scenario.network.lives)
+        return self.quantity == "time_above" or (self.quantity == "time_connected" and not planned)
+
     def decide(self, interval: QuantityInterval) -> str:
         """Return if a quantity in this interval reaches the target."""
         low, high = interval.low, interval.high
@@ -109,6 +119,9 @@ class Target(NamedTuple):
                 remedy = "ask for worst_rms; netkf compare-filters has the errors of both"
                 raise TheoryError(f"{rule}; {remedy}") from None
         elif self.quantity in NETWORK:
+            if self.quantity.endswith("_age") and not has_ages(scenario):
+                rule = "needs nodes that hear of the readings of others"
+                raise ScenarioError("--target", rule, self.quantity, "ask for worst_rms")
             metrics = dataclasses.replace(metrics, network=True)
         return dataclasses.replace(scenario, metrics=metrics)
 
@@ -185,10 +198,11 @@ def quantity_by_simulation(
     level: float,
     central: FloatArray | None,
     names: Sequence[str] = (),
+    rare: bool = False,
 ) -> QuantityInterval:
     """Return the quantity over runs with Student's interval, of the worst node for all nodes
     (Bonferroni), which misses it with probability ``level``; ``central`` (N,) are traces of P
-    to divide by, ``names`` those of ``metrics.quantities``.
+    to divide by, ``names`` those of ``metrics.quantities``. Of a share ``rare`` runs may be unseen.
     """
     if target.of_runs:
         values = metrics.quantities[:, [names.index(target.quantity)]]
@@ -202,13 +216,24 @@ def quantity_by_simulation(
     # A run that diverged is the worst.
     values = np.where(metrics.diverged > 0, 0.0 if target.least else np.inf, values)
     columns = values if target.of_worst else values.mean(axis=1, keepdims=True)
-    runs, count = columns.shape
-    with np.errstate(over="ignore", invalid="ignore"):
-        mean = columns.mean(axis=0)
-        error = columns.std(axis=0, ddof=1) / math.sqrt(runs)
-    width = float(scipy.special.stdtrit(runs - 1, 1.0 - level / (2.0 * count))) * error
+    tail = level / (2.0 * columns.shape[1])
+    mean, low, high = _student_ends(columns, tail)
+    if rare:
+        unseen = np.full((UNSEEN, 1), 1.0)
+        low = np.maximum(_student_ends(np.concatenate([columns, 0.0 * unseen]), tail)[1], 0.0)
+        high = np.minimum(_student_ends(np.concatenate([columns, unseen]), tail)[2], 1.0)
     # The largest mean lies between the largest lower and the largest upper end of all columns.
-    ends = np.array([mean.max(), (mean - width).max(), (mean + width).max()])
+    ends = np.array([mean.max(), low.max(), high.max()])
     ends = np.sqrt(np.maximum(ends, 0.0)) if target.of_errors else ends
     # nan is inf - inf of diverged runs, whose errors count as infinite.
     return QuantityInterval(*map(float, np.where(np.isnan(ends), np.inf, ends)))
+
+
+def _student_ends(columns: FloatArray, tail: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return means (N,) of ``columns`` (R, N) and ends that miss them with probability ``tail``."""
+    runs = len(columns)
+    with np.errstate(over="ignore", invalid="ignore"):
+        mean = columns.mean(axis=0)
+        error = columns.std(axis=0, ddof=1) / math.sqrt(runs)
+        width = float(scipy.special.stdtrit(runs - 1, 1.0 - tail)) * error
+        return mean, mean - width, mean + width

@@ -180,3 +180,10 @@ def test_totals_that_fade_mode_by_mode_are_information_about_the_state():
         exact, run = engine_covariance(short, "compiled")
         close(netkf.theory.error_covariance(short, run), exact, 1e-9)
         np.testing.assert_allclose(error_law(short, run).P, run.P, rtol=1e-9, atol=1e-12)
+
+
+def test_of_a_plant_that_stands_still_no_power_of_a_time_overflows():
+    """The cells of its table were 1e298 s long: warnings on the terminal."""
+    still = scenario(50, 0.7, {"kind": "none"}).replace({"plant.A": [[0.0] * 2] * 2})
+    run = netkf.simulate(still)
+    assert np.isfinite(run.P).all()

@@ -10,6 +10,8 @@ import scipy.stats
 import netkf
 from netkf.cli.main import main
 from netkf.runs.quantities import NETWORK
+from netkf.studies.metrics import RunMetrics
+from netkf.studies.targets import Target, quantity_by_simulation
 from tests.conftest import SCENARIOS
 
 RING = SCENARIOS / "poisson_ring.toml"
@@ -121,3 +123,44 @@ def test_filters_are_compared_by_them(tmp_path, capsys):
     # A swap forgets what the node knew.
     assert table["mean_age"][1] > table["mean_age"][0]
     assert pd.isna(table["joules"]).all()
+
+
+@pytest.mark.parametrize("runs", [32, 200, 1000])
+def test_shares_of_runs_that_rarely_differ_are_right(runs):
+    """Runs of share 0, and rare ones of share 1, against all that the binomial law can bring."""
+    level, hits = 1e-3, np.arange(runs + 1)
+    ends = []
+    for count in hits[: min(runs, 100)]:
+        shares = (np.arange(runs) < count).astype(float)[:, None]
+        metrics = RunMetrics(*np.zeros((3, runs, 1)), np.zeros((runs, 1)), shares + np.inf, shares)
+        target = Target("time_above", 0.5)
+        found = quantity_by_simulation(metrics, target, level, None, ["time_above"], rare=True)
+        assert 0.0 <= found.low <= count / runs <= found.high <= 1.0
+        ends.append((found.low, found.high))
+    low, high = np.array(ends).T
+    for mean in (1.0, 3.0, 6.0, 10.0, 20.0):
+        share = mean / runs
+        missed = (low > share) | (high < share)
+        assert scipy.stats.binom.pmf(hits[: len(low)][missed], runs, share).sum() < 3.0 * level
+
+
+@pytest.mark.parametrize("kind", ["central", "local"])
+def test_an_age_that_no_run_has_is_no_target(kind):
+    changes = {"filter": {"kind": kind}}
+    scenario = netkf.load(RING, changes)
+    with pytest.raises(netkf.ScenarioError, match="mean_age"):
+        netkf.size(scenario, "network.activation.rate", 1.0, 2.0, "mean_age<=1", runs=32)
+
+
+@pytest.mark.parametrize("runs", [1, 3])
+def test_quantiles_of_a_pooled_filter_are_between_samples_of_all_nodes(runs):
+    scenario = netkf.load(RING, {"filter": {"kind": "central"}, "horizon": 4.0})
+    row = netkf.sweep(scenario, {"seed": [1]}, runs=runs).iloc[0]
+    expected = []
+    for replica in range(runs):
+        states = netkf.simulate(scenario, seed=1, replica=replica).states
+        lengths = np.sqrt(states.loc[states["t"] > 0.0, "sq_error"])
+        expected.append(np.quantile(lengths, [0.5, 0.9, 0.99]))
+    np.testing.assert_allclose(
+        row[["quantile_50", "quantile_90", "quantile_99"]].astype(float), np.mean(expected, axis=0)
+    )
