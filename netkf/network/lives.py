@@ -62,9 +62,9 @@ class Life(Component):
     def changes(
         self, node: int, random: Callable[[], np.random.Generator], horizon: float
     ) -> Sequence[Change]:
-        """Return the changes of ``node`` before the ``horizon`` (seconds), in the order of time and
-        up and down in turn; ``random()`` is its stream. If the first one is up the node is down
-        until then.
+        """Return the changes of ``node`` after time 0 to the ``horizon`` (seconds) or later, in the
+        order of time and up and down in turn; ``random()`` is its stream. If the first one is up,
+        also after the horizon, the node is down until then.
         """
 
     def check(self, topology: Topology) -> None:
@@ -116,11 +116,11 @@ class DutyCycle(Life):
         found, first = [], -math.ceil(self.phase / self.period) - 1
         for k in itertools.count(first):
             begin = self.phase + k * self.period
+            found += [Change(begin, "restart"), Change(begin + self.up, "crash")]
             if begin >= horizon:
                 break
-            found += [Change(begin, "restart"), Change(begin + self.up, "crash")]
         # A node that is up at time 0 has not gone up in the run.
-        return [change for change in found if 0.0 < change.time < horizon]
+        return [change for change in found if change.time > 0.0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,10 +171,8 @@ class RecordedLife(Life):
     ) -> Sequence[Change]:
         """Return the rows of the node; those at time 0 or before say how it begins."""
         listed = self._table[0].get(node, [])
-        before = [change for change in listed if change.time <= 0.0]
-        after = [change for change in listed if 0.0 < change.time < horizon]
-        # A first change to what it is anyway, or a missing one, says how the node begins.
-        if before and not before[-1].up and (not after or not after[0].up):
+        after = [change for change in listed if change.time > 0.0]
+        if listed and not after and not listed[-1].up:
             return [Change(math.inf, "restart")]
         return after
 

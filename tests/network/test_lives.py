@@ -526,7 +526,34 @@ def test_crashes_have_their_law():
 def test_duty_cycles(phase, expected):
     life = DutyCycle(nodes=(0,), period=5.0, up=2.0, phase=phase)
     changes = life.changes(0, lambda: None, 10.0)
-    assert [(change.time, change.up) for change in changes] == expected
+    assert [(change.time, change.up) for change in changes if change.time < 10.0] == expected
+
+
+@pytest.mark.parametrize("memory", ["kept", "lost"])
+@pytest.mark.parametrize(
+    "life",
+    [
+        'kind = "recorded"\npath = "late.csv"',
+        'kind = "recorded"\npath = "twice.csv"',
+        'kind = "duty"\nperiod = 100.0\nup = 2.0\nphase = 50.0',
+    ],
+)
+def test_a_node_that_goes_up_after_the_run_is_down_in_it(scenario_of, life, memory):
+    files = {
+        "late.csv": "t,node,what\n10,1,join\n",
+        "twice.csv": "t,node,what\n-5,1,up\n-1,1,down\n1e6,1,up\n",
+        "down.csv": "t,node,what\n0,1,down\n",
+    }
+    prints = set()
+    for lives in (life, 'kind = "recorded"\npath = "down.csv"'):
+        text = f'[[network.lives]]\nnodes = [1]\nmemory = "{memory}"\n{lives}'
+        scenario = scenario_of(CLOCKS, text, files, filter_="hybrid")
+        for engine in ("simpy", "compiled"):
+            run = netkf.simulate(scenario, seed=2, engine=engine)
+            prints.add(run.fingerprint)
+            sent = run.events["kind"].isin(["sense", "send", "transmit", "absorb"])
+            assert 1 not in set(run.events["node"][sent])
+    assert len(prints) == 1
 
 
 def test_no_lives_is_todays_run(scenario_of):
