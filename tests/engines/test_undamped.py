@@ -131,3 +131,13 @@ def test_a_scalar_mean_at_the_critical_probability_is_infinite():
     for F in np.sqrt([2.0, 3.0, 5.0, 7.0, 10.0]):
         law = netkf.theory.scalar_law(F, 1.0, 1.0, 1.0, 1.0 - 1.0 / F**2)
         assert law.mean() == np.inf
+
+
+def test_a_constant_that_is_measured_has_no_limit():
+    """Of A = 0 without noise and increments: the run ended in a traceback."""
+    still = clocked(np.zeros((1, 1)), np.zeros((1, 1)), np.eye(1))
+    run = netkf.simulate(still)
+    with pytest.raises(netkf.TheoryError):
+        netkf.theory.central_covariance(still)
+    expected = 1.0 / (1.0 + run.times / float(np.asarray(still.sensors[0].R)[0, 0]))
+    np.testing.assert_allclose(run.P[:, 0, 0, 0], expected, rtol=1e-12)

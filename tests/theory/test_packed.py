@@ -6,7 +6,7 @@ import scipy.integrate
 import scipy.linalg
 import scipy.sparse
 
-from netkf import theory
+from netkf import TheoryError, theory
 from netkf.network.spectra import connected_parts
 from netkf.theory.hybrid import bounds, coupled, dense, linearised, steady
 from netkf.theory.hybrid.coupled import CoupledRiccati
@@ -240,6 +240,14 @@ def test_riccati_equations_of_few_states_have_the_solutions_of_scipy():
         terms = np.abs(A @ got).max() + np.abs(got @ G @ got).max()
         assert np.abs(A @ got + got @ A.T + Q - got @ G @ got).max() <= 1e-11 * terms
         near(got, expected, 1e-7)
+
+
+@pytest.mark.parametrize("A", [[[0.0]], [[0.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [-1.0, 0.0]]])
+def test_what_neither_fades_nor_is_driven_has_no_stabilising_solution(A):
+    """P falls to 0 as 1 / t, and so does the gain."""
+    A = np.array(A)
+    with pytest.raises(TheoryError):
+        matrices.algebraic_riccati(A, np.zeros(A.shape), 2.0 * np.eye(len(A)))
 
 
 @pytest.mark.parametrize("connection", ["strong", "weak"])

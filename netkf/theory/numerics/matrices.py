@@ -146,9 +146,12 @@ def algebraic_riccati(A: FloatArray, Q: FloatArray, G: FloatArray) -> FloatArray
             return _refined(A, Q, G, np.linalg.solve(U.T, V.T).real)
     try:
         S: Any = scipy.linalg.solve_continuous_are(A.T, square_root(G), Q, np.eye(len(A)))
+        return _refined(A, Q, G, S)
+    except TheoryError:
+        raise
     except (np.linalg.LinAlgError, ValueError) as error:
+        # scipy answers 0 for a constant without noise, of which no Newton step exists.
         raise TheoryError(f"no stabilising solution of the Riccati equation: {error}") from None
-    return _refined(A, Q, G, S)
 
 
 def _refined(A: FloatArray, Q: FloatArray, G: FloatArray, S: FloatArray) -> FloatArray:
