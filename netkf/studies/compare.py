@@ -152,9 +152,10 @@ class RunDirectory:
                 return None
             traces = [name for name in names if DIAGONAL.match(name)]
             truth = [name for name in names if name[:1] == "x" and name[1:].isdecimal()]
-            states = read_numbers(file, ["run", "t", "node", "sq_error", "nees"])
-            # A node may estimate fewer states than others.
-            states = states.join(read_numbers(file, [*traces, *truth], allow_empty=True))
+            states = read_numbers(file, ["run", "t", "node", "sq_error"])
+            # A node may estimate fewer states than others, and a singular P has no NEES.
+            empty = ["nees", *traces, *truth]
+            states = states.join(read_numbers(file, empty, allow_empty=True))
         complete = states["run"].nunique() == self.runs
         states["mean_trace"] = states[traces].sum(axis=1, min_count=1)
         return states[states["t"] > 0.0] if complete else None

@@ -749,6 +749,18 @@ def test_pairs_are_compared_run_by_run(ensembles):
     assert entry.difference == pytest.approx(gaps.mean())
 
 
+def test_ensembles_of_a_known_start_are_compared_run_by_run(tmp_path):
+    """P(0) = 0 has no NEES: the directories were called damaged."""
+    for name, rate in (("slow", 1.0), ("fast", 8.0)):
+        sets = [f"{RATE}={rate}", "horizon=1.0", "filter.cov=[[0.0, 0.0], [0.0, 0.0]]"]
+        sets += ["plant.cov=[[0.0, 0.0], [0.0, 0.0]]"]
+        options = [part for text in sets for part in ("--set", text)]
+        out = ["--out", str(tmp_path / name), "--no-plot", "--workers", "1"]
+        assert main(["run", RING, *options, "--runs", "3", "--trace", "full", *out]) == 0
+    found = rows_of(compare([tmp_path / "slow", tmp_path / "fast"]))
+    assert found["mean_nees", -1][1].method == "paired"
+
+
 def test_others_are_compared_by_their_standard_errors(ensembles):
     found = rows_of(compare([ensembles / "slow", ensembles / "bare"], confidence=0.9))
     one, two = found["rms_error", 2]
