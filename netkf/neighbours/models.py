@@ -28,7 +28,7 @@ Changes = Mapping[str, Any] | None
 
 
 def from_control(
-    system: Any, Q: Any, R: Any, changes: Changes = None, *, G: Any = None
+    system: Any, Q: Any = None, R: Any = None, changes: Changes = None, *, G: Any = None
 ) -> Scenario:
     """Return a scenario that runs from a linear ``system``: a StateSpace of python-control, an lti
     or dlti of scipy.signal, continuous or discrete.
@@ -36,8 +36,9 @@ def from_control(
     The state is driven by ``G w``, G (n, m), by default the identity, with the covariance ``Q``
     (m, m) of w, in continuous time its intensity; ``G=system.B`` is noise at the inputs, as
     ``control.lqe(system, Q, R)`` has it. ``R`` (p, p) is the covariance, or the intensity, of the
-    noise of the outputs. If R is diagonal, node k reads output k, else node 0 reads all of them.
-    States have the names that python-control has for them.
+    noise of the outputs; by default both are identities, since a state space has no noise. If R is
+    diagonal, node k reads output k, else node 0 reads all of them. States have the names that
+    python-control has for them.
 
     The network is complete, and the filter ``central``, the Kalman filter of all readings.
     ``changes`` are values by key, as in ``netkf.load``, for what a state space does not say:
@@ -59,7 +60,8 @@ def from_control(
     A, C = (matrix(name, np.asarray(getattr(space, name))) for name in "AC")
     gain = np.eye(len(A)) if G is None else _shaped("G", matrix("G", np.atleast_2d(G)), len(A))
     hint = "correct it" + ", or give G = system.B for noise at the inputs" * (G is None and known)
-    noise = _shaped("Q", covariance("Q", np.atleast_2d(Q)), gain.shape[1], hint)
+    given = np.eye(gain.shape[1]) if Q is None else np.atleast_2d(Q)
+    noise = _shaped("Q", covariance("Q", given), gain.shape[1], hint)
     named = str(getattr(system, "name", None) or "")
     table: dict[str, Any] = {"name": named if named and "[" not in named else "system"}
     if space.dt is None or (space.dt == 0 and space.dt is not False):
@@ -74,7 +76,7 @@ def from_control(
     states = [str(label) for label in getattr(system, "state_labels", ())]
     if states and not any("[" in name for name in states):  # x[0], .. if nobody named them
         table["plant"]["states"] = states
-    scenario = _scenario(table, C, R, space.B, changes)
+    scenario = _scenario(table, C, np.eye(len(C)) if R is None else R, space.B, changes)
     if np.any(space.D) and getattr(scenario.plant, "input", None) is not None:
         rule = "feeds the input through to the readings, which netkf does not"
         remedy = "subtract D u from the outputs and set D = 0"

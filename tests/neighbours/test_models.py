@@ -54,6 +54,9 @@ def test_scipy_systems_and_a_network():
     np.testing.assert_allclose(run.x, x, atol=1e-12)  # without noise, the response to the input
     transfer = signal.dlti([1.0], [1.0, -0.5], dt=0.1)
     assert netkf.from_control(transfer, 1.0, 1.0).plant.F.tolist() == [[0.5]]
+    by_default = netkf.from_control(system)
+    assert by_default.plant.Q.tolist() == np.eye(2).tolist()
+    assert [sensor.R.tolist() for sensor in by_default.sensors] == [[[1.0]], [[1.0]]]
     alone = signal.StateSpace(A, np.zeros((2, 0)), C, np.zeros((2, 0)))
     assert netkf.from_control(alone, np.eye(2), R).plant.A.tolist() == A.tolist()  # no inputs
     correlated = netkf.from_control(system, np.eye(2), [[1.0, 0.3], [0.3, 1.0]])
