@@ -18,7 +18,7 @@ from netkf.logs.recorded_network import Files
 from netkf.network.clocks import LinkClock
 from netkf.network.lives import lifetimes
 from netkf.rng.streams import Streams
-from netkf.runs.files import require_run
+from netkf.runs.files import require_trace
 from netkf.scenario.positions import tick_times
 from netkf.scenario.sampling import all_sample_times
 from netkf.scenario.scenario import Scenario
@@ -70,7 +70,7 @@ def export_recorded(run: Run, out: str | Path) -> tuple[Path, ...]:
 
 
 def _new_folder(run: Run, out: str | Path) -> tuple[Path, Scenario]:
-    folder, scenario = as_path("out", out), require_run(run)
+    folder, scenario = as_path("out", out), require_trace(run)
     if folder.exists() and any(folder.iterdir() if folder.is_dir() else [folder]):
         rule = "must be a new or empty folder"
         raise ScenarioError(str(folder), rule, None, "choose another folder")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from netkf.network.graphs import Link
-from netkf.runs.files import output_file, require_run, write_atomically
+from netkf.runs.files import output_file, require_trace, write_atomically
 from netkf.trace.messages import DELIVERED, LATE, LOST, by_link, join_messages
 from netkf.trace.run import Run
 
@@ -45,7 +45,7 @@ def carried_network(run: Run) -> networkx.Graph[Any]:
     """
     import networkx
 
-    scenario = require_run(run)
+    scenario = require_trace(run)
     topology, delivery = scenario.topology, scenario.topology.delivery or {}
     one_way = topology.directed or any(p != delivery.get((j, i)) for (i, j), p in delivery.items())
     carried: dict[Link, dict[str, Any]] = {}

@@ -16,7 +16,7 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import number
-from netkf.runs.files import output_file, require_run, write_atomically
+from netkf.runs.files import output_file, require_trace, write_atomically
 from netkf.trace.messages import LOST, join_messages
 from netkf.trace.nees import traces
 from netkf.trace.run import Run
@@ -43,7 +43,7 @@ def export_perfetto(
 
     Raises ScenarioError for a window in which there is nothing, and WriteError.
     """
-    require_run(run)
+    require_trace(run)
     last = max([0.0, *run.times[-1:].tolist(), *run.log["t"][-1:].tolist()])
     begin = number(low=0.0)("begin", begin)
     end = last if end is None else number(low=0.0)("end", end)

@@ -185,6 +185,15 @@ def require_run(run: object) -> Scenario:
     return scenario
 
 
+def require_trace(run: object) -> Scenario:
+    """Return the scenario of a run; raises ScenarioError for one whose trace was not kept."""
+    scenario = require_run(run)
+    if isinstance(run, Run) and not len(run.times):
+        rule, remedy = "has no events and samples", "run it again with --trace full"
+        raise ScenarioError("run", rule, None, remedy)
+    return scenario
+
+
 def output_file(out: str | Path, name: str) -> Path:
     """Return the file to write, ``out`` or in that folder ``name``, which must be new."""
     path = as_path("out", out)

@@ -7,6 +7,7 @@ import pytest
 import netkf
 from netkf.cli.main import main
 from netkf.neighbours.graphml import carried_network
+from tests.conftest import SCENARIOS
 
 
 def test_links_have_what_they_carried(run, tmp_path):
@@ -81,3 +82,13 @@ def test_the_command_writes_into_the_run(run, tmp_path, capsys):
         assert error.count("\n") == 1
     with pytest.raises(netkf.ScenarioError, match="must be a run with its scenario"):
         netkf.export_graphml(None, tmp_path / "x")
+
+
+def test_what_tells_of_events_needs_the_trace_of_the_run(tmp_path, capsys):
+    out = str(tmp_path / "run")
+    options = ["--set", "horizon=2.0", "--engine", "simpy", "--no-plot", "--trace", "none"]
+    assert main(["run", str(SCENARIOS / "poisson_ring.toml"), "--out", out, *options]) == 0
+    for form in ("log", "recorded", "graphml", "perfetto"):
+        assert main(["export", out, "--to", form, "--out", str(tmp_path / form)]) == 2
+        assert "run: has no events and samples" in capsys.readouterr().err
+        assert not (tmp_path / form).exists()
