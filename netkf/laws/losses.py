@@ -56,14 +56,13 @@ class LossLaw(NamedTuple):
     share: float = 0.0
     hops: FloatArray | None = None
 
-    def expected(self, sent: np.ndarray) -> FloatArray:
-        """Return how many of the first messages ``sent`` (R, D) of directions are lost on average.
-
-        A run need not end with the last hop.
+    def expected(self, sent: np.ndarray, directions: np.ndarray) -> FloatArray:
+        """Return how many of the first messages ``sent`` (R, K) of K ``directions`` (indices) are
+        lost on average; a run need not end with the last hop.
         """
         if self.hops is None:
-            return np.asarray(sent * self.lost)
-        sums = np.cumsum(np.pad(self.hops, ((0, 0), (1, 0))), axis=1)
+            return np.asarray(sent * self.lost[directions])
+        sums = np.cumsum(np.pad(self.hops[directions], ((0, 0), (1, 0))), axis=1)
         cycles, rest = np.divmod(sent, self.hops.shape[1])
         return np.asarray(cycles * sums[:, -1] + sums[np.arange(len(sums)), rest])
 
@@ -160,8 +159,8 @@ def direction_label(link: tuple[int, int]) -> str:
 def _loss_interval(
     law: LossLaw, sent: np.ndarray, lost: np.ndarray, directions: np.ndarray, level: float
 ) -> Interval:
-    stated = law.expected(sent)[:, directions]
     q, sent, lost = law.lost[directions], sent[:, directions], lost[:, directions]
+    stated = law.expected(sent, directions)
     total, losses = float(sent.sum()), lost.sum(axis=1)
     excess, expected = (lost - stated).sum(axis=1), float(stated.sum()) / total
     if len(directions) == 1 and law.independent:
