@@ -375,13 +375,25 @@ def test_recorded_ticks_and_losses_agree(ring, tmp_path):
     assert run.count("tick") == 4
 
 
-@pytest.mark.parametrize("delay", [{"kind": "exponential", "mean": 2.0}, {"kind": "none"}])
-def test_windows_rows_visits_and_mail_end_anywhere(ring, monkeypatch, delay):
+POISSON, TOGETHER = {"kind": "poisson", "rate": 40.0}, {"kind": "periodic", "period": 0.05}
+
+
+@pytest.mark.parametrize(
+    "clock, delay",
+    [
+        (POISSON, {"kind": "exponential", "mean": 2.0}),
+        (POISSON, {"kind": "none"}),
+        (TOGETHER, {"kind": "none"}),
+        (TOGETHER | {"at": "nodes"}, {"kind": "none"}),
+        (TOGETHER, {"kind": "constant", "seconds": 0.2}),
+    ],
+)
+def test_windows_rows_visits_and_mail_end_anywhere(ring, monkeypatch, clock, delay):
     """Whatever is handed over in blocks, the run does not change."""
     busy = ring.replace(
         {
             "horizon": 4.0,
-            "network.activation.rate": 40.0,
+            "network.activation": clock,
             "network.channel.delay": delay,
             "network.channel.symmetric": False,
         }
