@@ -379,7 +379,7 @@ POISSON, TOGETHER = {"kind": "poisson", "rate": 40.0}, {"kind": "periodic", "per
 
 
 @pytest.mark.parametrize(
-    "clock, delay",
+    ("clock", "delay"),
     [
         (POISSON, {"kind": "exponential", "mean": 2.0}),
         (POISSON, {"kind": "none"}),

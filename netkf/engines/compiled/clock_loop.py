@@ -187,8 +187,8 @@ def clock_loop(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs)
         predict_participants(state, record, run, verbs, event, now)
         if event == ON_TICK:
             on_tick(state, record, run, verbs, now)
-            # Absorptions come next, unless there are other events at this instant. They may be those
-            # of many ticks, which need more space than one event.
+            # Absorptions come next, unless there are other events at this instant: those of all its
+            # ticks, which need more space than one event.
             if verbs.remembers == 0 and state.receivers > 0 and ends_instant(state, now):
                 sort_indices(state.waiting, state.receivers)
                 while state.receivers > 0 and find_shortage(state, now) == GO_ON:
