@@ -6,7 +6,14 @@ from netkf.ensembles.directory import FinishedEnsemble
 from netkf.figures.figure_data import FigureData, reduce_completed_run, reduce_ensemble
 from netkf.figures.network import draw_network, error_label, node_values
 from netkf.figures.panels import draw_covariances, draw_errors, draw_nees
-from netkf.figures.style import Picture, finish_figure, new_figure, style_context, write_figure
+from netkf.figures.style import (
+    Picture,
+    draw_message,
+    finish_figure,
+    new_figure,
+    style_context,
+    write_figure,
+)
 from netkf.runs.run import CompletedRun
 from netkf.scenario.scenario import Scenario
 
@@ -40,7 +47,10 @@ def overview(data: FigureData) -> Picture:
         drawings = [draw_errors, draw_covariances]
     *panels, network = (figure.add_subplot(cell) for cell in cells)
     for axes, draw in zip(panels, drawings, strict=True):
-        draw(axes, data)
+        if len(data.times):
+            draw(axes, data)
+        else:
+            draw_message(axes, "there are no samples")
     key, label = error_label(data)
     draw_network(network, data, node_values(data, key), label)
     network.legend(loc="lower left", bbox_to_anchor=(0.0, 1.04), ncols=2, borderaxespad=0.2)

@@ -86,7 +86,7 @@ def test_text_neither_overlaps_nor_leaves_the_canvas(drawing, kind, name):
 SAYS = {
     "one node": ("error", "In this run the node claims"),
     "no truth": ("error", "Without ground truth"),
-    "no samples": ("error", "There are no samples"),
+    "no samples": ("overview", "there are no samples"),
     "interrupted": ("error", "Interrupted: "),
     "diverged": ("error", "Diverged: "),
     "ring": ("nis", "NIS per row of a reading is"),
