@@ -156,15 +156,18 @@ class RecordedLife(Life):
         return np.array([t for _, t in self._table[1]])
 
     def use(self, end: float) -> RowUse:
-        """Return the use of the rows by a run to ``end`` (s): those after 0, and the last one until
-        then, which says how a node begins.
+        """Return the use of the rows by a run to ``end`` (s): those after 0, and the one that says
+        how a node begins: the last one until then, or the first one if the node goes up by it.
         """
         found, keys = self._table
         first = {
             node: max((change.time for change in changes if change.time <= 0.0), default=0.0)
             for node, changes in found.items()
         }
-        return count_rows(self.path.name, keys, lambda key: first[key[0]] <= key[1] < end)
+        ups = {(node, max(0.0, c[0].time)) for node, c in found.items() if c[0].up}
+        return count_rows(
+            self.path.name, keys, lambda key: first[key[0]] <= key[1] < end or key in ups
+        )
 
     def changes(
         self, node: int, random: Callable[[], np.random.Generator], horizon: float

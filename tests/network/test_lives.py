@@ -556,6 +556,13 @@ def test_a_node_that_goes_up_after_the_run_is_down_in_it(scenario_of, life, memo
     assert len(prints) == 1
 
 
+def test_the_row_that_says_how_a_node_begins_is_used(scenario_of):
+    life = '[[network.lives]]\nnodes = [1, 2]\nkind = "recorded"\npath = "l.csv"'
+    rows = "t,node,what\n10,1,join\n20,1,leave\n-2,2,up\n-1,2,down\n20,2,up\n"
+    scenario = scenario_of(CLOCKS, life, {"l.csv": rows}, filter_="hybrid")
+    assert scenario.network.lives[0].use(10.0).used == 2
+
+
 def test_no_lives_is_todays_run(scenario_of):
     # A cycle that never ends within the run: everybody is up all the time.
     life = '[[network.lives]]\nkind = "duty"\nnodes = [0, 1, 2]\nperiod = 100.0\nup = 99.0'
