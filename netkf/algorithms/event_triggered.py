@@ -48,6 +48,7 @@ def emit(record: Any, h: int, m: int, run: Any) -> None:
     lanes, payload, x, root = run.lanes, record.payload, record.xhat, record.root
     near = is_near(run, x, root, h, record.sent_x, record.sent_root, h, record.alpha, record.ratio)
     known = load_flags(lanes, record.has_sent, h)
+    store_flags(lanes, record.awake, h, load_flags(lanes, run.sends))
     silent = select(known, select(near, 1.0, 0.0), 0.0) > 0.0
     sent = select(silent, 0.0, select(load_flags(lanes, run.sends), 1.0, 0.0)) > 0.0
     store_flags(lanes, run.sends, sent)
@@ -77,6 +78,9 @@ def absorb(record: Any, h: int, run: Any) -> None:
     copied = spread(lanes, 0.0)
     for w in range(first[h], first[h + 1]):
         copied += load(lanes, record.weight, w)
+    # A node that is down hears no silence.
+    copied = select(load_flags(lanes, record.awake, h), copied, 0.0)
+    store_flags(lanes, record.awake, h, spread(lanes, 0.0) > 0.0)
     # A node without any copy keeps its estimate, without rounding.
     if not any_lane(copied > 0.0):
         return
@@ -134,7 +138,10 @@ def event_triggered_ci_record(
     n, flag = len(models[0].information), ((), np.uint8)
     alpha, delta = filtering.thresholds
     return Record(
-        node={"sent_x": (n,), "sent_root": (n, n), "has_sent": flag, "inverse": (n, n)},
+        node={
+            **{"sent_x": (n,), "sent_root": (n, n), "inverse": (n, n)},
+            **{"has_sent": flag, "awake": flag},
+        },
         link={
             **{"copy_x": (n,), "copy_root": (n, n), "copy_inverse": (n, n)},
             **{"has_copy": flag, "fresh": flag, "weight": ()},

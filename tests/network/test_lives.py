@@ -299,6 +299,17 @@ def test_slots(scenario_of, filter_):
         assert slots[node] == {t for t in every if not is_down(t, node)}
 
 
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+@pytest.mark.parametrize("filter_", ["kcf", 'event-triggered"\ntrigger = "consensus'])
+def test_who_is_down_in_slots_only_predicts(scenario_of, filter_, engine):
+    """The silence of others tells it nothing either."""
+    lives, files = recorded("kept")
+    run = netkf.simulate(scenario_of(SLOTS, lives, files, filter_=filter_), engine=engine)
+    down = [2, 3, 4, 6, 7]
+    before = run.P[[k - 1 for k in down], 1]
+    np.testing.assert_allclose(run.P[down, 1], 1.21 * before + 0.4, rtol=1e-12)
+
+
 OWN = {
     "hybrid": "epsilon = 0.4\n",
     "kcf": "epsilon = 0.1\n",
