@@ -255,8 +255,8 @@ def unwrap(numbers: np.ndarray, times: FloatArray) -> tuple[np.ndarray, int, int
             offset, wraps = offset + modulus, wraps + 1
         elif falls or (k and MAX_SKIP < number - last > 10.0 * expected and not wraps):
             offset, restarts = top + 1 - number, restarts + 1
-        # One of before the wrap may come late.
-        is_late = wraps and not falls and number > last + modulus / 2
+        # One of before the wrap may come late, but not after as much time as it is ahead.
+        is_late = wraps and not falls and number - last > max(0.5 * modulus, 2.0 * expected)
         counter = number + offset - (modulus if is_late else 0)
         counters[place[k]] = counter
         if not k or counter > top:

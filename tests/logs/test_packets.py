@@ -217,6 +217,18 @@ def test_counters_grow_on_through_wraps_holes_and_late_rows(modulus, delivery):
         assert wraps == true[-1] // modulus - true[0] // modulus
 
 
+@pytest.mark.parametrize("modulus", [16, 100, 256, 65536])
+@pytest.mark.parametrize("share", [0.55, 0.7, 0.9])
+def test_after_a_hole_of_half_a_cycle_packets_are_not_late_ones_of_before(modulus, share):
+    true = np.arange(4 * modulus)[:: max(1, modulus // 1000)]
+    begin = 2.05 * modulus
+    true = true[(true < begin) | (true > begin + share * modulus)]
+    times = true + np.random.default_rng(modulus).uniform(0.0, 0.4, len(true))
+    counters, _, _, restarts = unwrap(true % modulus, times)
+    assert restarts == 0
+    assert (np.diff(counters) == np.diff(true)).all()
+
+
 @pytest.mark.parametrize("logged", [True, False])
 @pytest.mark.parametrize(
     ("modulus", "interval", "stamp", "lead"),
