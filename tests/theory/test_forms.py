@@ -1,6 +1,7 @@
 """Forms of noises."""
 
 import numpy as np
+import pytest
 
 from netkf.theory.common.forms import Forms
 
@@ -42,3 +43,13 @@ def test_rows_that_come_back_are_clean():
     again = forms.take(5)
     assert not forms.table[again, : forms.used].any()
     assert forms.table[kept, : forms.used].tolist() == [[0.0, 3.0, 0.0]]
+
+
+@pytest.mark.parametrize("count", [1, 60])
+def test_large_tables_are_reduced_rarely(monkeypatch, count):
+    forms, reductions, qr = Forms(1), [], np.linalg.qr
+    rows = forms.take(300)
+    monkeypatch.setattr(np.linalg, "qr", lambda *a, **k: reductions.append(1) or qr(*a, **k))
+    for first in (forms.inputs(count) for _ in range(1800 // count)):
+        forms.table[rows[:count], first : first + count] += np.eye(count)
+    assert len(reductions) < 6

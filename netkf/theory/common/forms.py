@@ -17,7 +17,7 @@ from netkf.linalg.arrays import FloatArray, IntArray
 MEAN, NOISE = range(2)
 """The first column holds means; inputs begin with column NOISE."""
 SPARE = 64
-"""Columns beyond the number of rows between two reductions."""
+"""Least number of columns beyond the number of rows between two reductions."""
 
 
 class Forms:
@@ -75,7 +75,8 @@ class Forms:
             # inputs' = Q R, so inputs inputs' = R' R.
             inputs = cast(FloatArray, np.linalg.qr(inputs.T, mode="r")).T
         used = frozen + inputs.shape[1]
-        width = max(frozen + len(rows), used) + count + SPARE
+        # A reduction costs as much as many products with the table: it waits for as many columns.
+        width = max(frozen + len(rows), used) + count + max(SPARE, len(rows))
         new = np.zeros((len(old), used))
         new[:, :frozen], new[:, frozen:] = old[:, :frozen], inputs
         self.table = np.zeros((len(self.table), width))
