@@ -11,20 +11,18 @@ from netkf.cli import process
 from netkf.core.printable import one_line
 
 CLEAR_LINE = "\r\033[K"
-REPORT_SECONDS = 20.0
-"""Seconds between two reports of a command whose standard error is a file or a pipe."""
 QUIET_SECONDS = 2.0
 """Seconds without an update after which the line shows the time that the command has taken."""
 
 
 class ProgressLine:
     """Context manager with a line on standard error that each update overwrites; it is cleared at
-    the end. Nothing but reports is printed if standard error is not a terminal.
+    the end. Nothing is printed if standard error is not a terminal.
     """
 
     def __init__(self) -> None:
         self._is_terminal, self._printed = sys.stderr.isatty(), False
-        self._began = self._reported = self._updated = time.monotonic()
+        self._began = self._updated = time.monotonic()
         self._text, self._ended = "", threading.Event()
 
     def __enter__(self) -> ProgressLine:
@@ -60,14 +58,6 @@ class ProgressLine:
                 self._printed = True
                 seconds = f"{time.monotonic() - self._began:.0f} s so far"
                 _print_direct(one_line(f"{self._text}; {seconds}" if self._text else seconds))
-
-    def report(self, text: str) -> None:
-        """Replace the line by a text; without a terminal print it every REPORT_SECONDS seconds."""
-        self.replace(text)
-        now = time.monotonic()
-        if not self._is_terminal and now - self._reported >= REPORT_SECONDS:
-            self._reported = now
-            print(f"netkf: {text}", file=sys.stderr, flush=True)
 
     def make_time_update(self, horizon: float) -> Callable[[float], None]:
         """Return a function of the simulated time (s) that shows its share of ``horizon``."""

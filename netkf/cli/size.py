@@ -31,7 +31,7 @@ def _run(options: argparse.Namespace) -> int:
             options.runs,
             options.confidence,
             **pool_settings(options),
-            progress=line.report,
+            progress=line.replace,
         )
     print_table_notes(scenario)
     if options.json:

@@ -479,15 +479,14 @@ def test_a_value_too_close_to_the_limit_is_given_up(short):
     assert found.table["by"].eq("simulation").all()
 
 
-def test_a_long_search_reports_without_a_terminal(short, monkeypatch, capsys):
-    from netkf.cli import progress
-
-    monkeypatch.setattr(progress, "REPORT_SECONDS", 0.0)
-    arguments = ["size", RING, "--set", "horizon=2.0", "--vary", f"{RATE}=0.5:50", "--runs", "64"]
-    main([*arguments, "--target", "mean_trace<=2.5", "--by", "simulation"])
-    lines = capsys.readouterr().err.splitlines()
+def test_a_search_tells_its_progress_to_a_terminal_alone(short, capsys):
+    lines: list[str] = []
+    size(short, RATE, 0.5, 50.0, "mean_trace<=2.5", by="simulation", runs=64, progress=lines.append)
     assert any("simulating" in line for line in lines)
     assert any("after 32 of at most 64 runs" in line for line in lines)
+    arguments = ["size", RING, "--set", "horizon=2.0", "--vary", f"{RATE}=0.5:50", "--runs", "64"]
+    main([*arguments, "--target", "mean_trace<=2.5", "--by", "simulation"])
+    assert "simulating" not in capsys.readouterr().err
 
 
 def test_simulation_brackets_what_a_long_simulation_says(build):
