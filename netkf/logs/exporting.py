@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from netkf.core.errors import ScenarioError
+from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import as_path
 from netkf.logs.importing import write_files
 from netkf.logs.packet_tables import EXPORTED
@@ -47,11 +47,7 @@ def export_recorded(run: Run, out: str | Path) -> tuple[Path, ...]:
     network: Any = table["network"]
     files: Files = {}
     network.pop("radio", None)
-    messages = join_messages(run.log)
-    if scenario.slotted:
-        # Samples at the horizon use messages that are not in the log of the run.
-        longer = join_messages(with_last_exchanges(scenario, run).log)
-        messages = np.concatenate([messages, longer[longer["sent"] >= scenario.horizon]])
+    messages = _messages_of(scenario, run, to_the_end=True)
     if len(messages):
         files |= _outcomes(scenario, messages, network.setdefault("channel", {}))
     if scenario.network.lives:
@@ -77,6 +73,24 @@ def _new_folder(run: Run, out: str | Path) -> tuple[Path, Scenario]:
     return folder, scenario
 
 
+def _messages_of(scenario: Scenario, run: Run, to_the_end: bool) -> np.ndarray:
+    """Return the MESSAGE rows of a run in the order of sending, with those in slots at the horizon,
+    which samples there use; raises TheoryError if they are wanted ``to_the_end`` and unknown.
+    """
+    logs = [run.log]
+    try:
+        if scenario.slotted and (whole := with_last_exchanges(scenario, run)) is not run:
+            logs.append(whole.log)
+    except TheoryError:
+        if to_the_end:
+            raise
+    found = [join_messages(log) for log in logs]
+    found = [rows[np.argsort(rows["sent_row"], kind="stable")] for rows in found]
+    return np.concatenate(
+        [found[0], *(rows[rows["sent"] >= scenario.horizon] for rows in found[1:])]
+    )
+
+
 def _outcomes(scenario: Scenario, messages: np.ndarray, channel: dict[str, Any]) -> Files:
     """Return the tables of losses and delays, which the ``channel`` names from now on."""
     # What was lost on arrival took its time: its hearer was down.
@@ -87,11 +101,15 @@ def _outcomes(scenario: Scenario, messages: np.ndarray, channel: dict[str, Any])
     rows = pd.DataFrame({name: messages[name] for name in ("sender", "receiver")})
     rows["message"] = messages["number"]
     losses = rows.assign(delivered=arrives.astype(int))
-    delays = rows.assign(seconds=[repr(t) for t in took.tolist()])[arrives]
     channel.pop("channels", None)
     channel["loss"] = {"kind": "recorded", "path": "losses.csv", "after": "refuse"}
-    channel["delay"] = {"kind": "recorded", "path": "delays.csv", "after": "refuse"}
-    return {"losses.csv": losses.to_csv(index=False), "delays.csv": delays.to_csv(index=False)}
+    files: Files = {"losses.csv": losses.to_csv(index=False)}
+    # Without delays the twin is computed as the run was, to the bit.
+    if scenario.network.channel.delay.fixed != 0.0 or took[arrives].any():
+        delays = rows.assign(seconds=[repr(t) for t in took.tolist()])[arrives]
+        files["delays.csv"] = delays.to_csv(index=False)
+        channel["delay"] = {"kind": "recorded", "path": "delays.csv", "after": "refuse"}
+    return files
 
 
 def _lives(scenario: Scenario, run: Run, network: dict[str, Any]) -> Files:
@@ -153,10 +171,9 @@ def export_log(run: Run, out: str | Path) -> tuple[Path, ...]:
     Raises ScenarioError for a run without a scenario or messages, and WriteError.
     """
     folder, scenario = _new_folder(run, out)
-    messages = join_messages(run.log)
+    messages = _messages_of(scenario, run, to_the_end=False)
     if not len(messages):
         raise ScenarioError("run", "has no messages", None, "only runs with a network are logs")
-    messages = messages[np.argsort(messages["sent_row"], kind="stable")]
     names = {int(node): str(node) for node in scenario.nodes}
     outcome = messages["outcome"]
     arrivals = np.where(outcome == UNDER_WAY, np.inf, messages["ended"])

@@ -386,6 +386,12 @@ class RecordedClock(LinkClock):
         return {entity: np.unique(snap(np.array(t))) for entity, t in times.items()}
 
     @property
+    def all_apart(self) -> bool:
+        """True if no two entities tick at one time."""
+        times = np.concatenate([np.empty(0), *self._instants.values()])
+        return len(np.unique(times)) == len(times)
+
+    @property
     def rows(self) -> FloatArray:
         """The times (K,) of all rows in seconds, in the order of the table."""
         return self._table["t"]

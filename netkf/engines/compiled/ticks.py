@@ -33,7 +33,7 @@ from netkf.engines.compiled.senders import Senders, senders_of
 from netkf.engines.compiled.state import Instants, TickArrays
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
-from netkf.network.clocks import LinkClock, Periodic, Poisson, Renewal
+from netkf.network.clocks import LinkClock, Periodic, Poisson, RecordedClock, Renewal
 from netkf.network.losses import Transmission, law_in_kernels
 from netkf.rng.draws import Ziggurat, fill_units, next_exponential, next_unit, ziggurat
 from netkf.rng.numbers import NormalZiggurat, next_gamma, normal_ziggurat
@@ -329,6 +329,9 @@ def is_kernel_clock(clock: object) -> bool:
 
 def ticks_apart(clock: object) -> bool:
     """Return True if two entities tick at one time with probability 0 only, and so do not."""
+    if type(clock) is RecordedClock:
+        # The replay of a log is then computed as its run was, to the bit.
+        return clock.all_apart
     if type(clock) is Periodic:
         return clock.phase == "random" or clock.jitter > 0.05 * clock.period
     if type(clock) is Renewal:
