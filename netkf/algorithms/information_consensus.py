@@ -227,8 +227,18 @@ class Hcmci(InformationConsensus):
     def needs(self) -> Needs:
         """Its demands on a scenario: those of its base, and settings that fit it."""
         return Needs(
-            one_way=True, inverts=True, check=self._check_scenario, notes=information_notes
+            one_way=True, inverts=True, check=self._check_scenario, notes=self._scenario_notes
         )
+
+    def _scenario_notes(self, scenario: Any) -> tuple[str, ...]:
+        notes, parts = information_notes(scenario), len(scenario.topology.components)
+        if parts == 1 or self.consensus == INFORMATION or self.novelty_weight is not None:
+            return notes
+        rule = (
+            f"readings count {len(scenario.nodes)} times, for all nodes, but the graph has {parts}"
+        )
+        remedy = "give novelty_weight, the nodes of a part"
+        return (*notes, f"hcmci: {rule} parts: P is overconfident; {remedy}")
 
     def _check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError where the variant does not fit a ``netkf.Scenario``."""

@@ -304,3 +304,23 @@ def test_every_filter_under_clocks_is_refused_in_one_line_or_runs(case, tmp_path
             assert np.isfinite(run.P).all(), (name, at)
             ran += 1
     assert ran > 10
+
+
+@pytest.mark.parametrize(("weight", "nees"), [({}, 4.0), ({"novelty_weight": 2.0}, 2.0)])
+def test_readings_that_count_for_nodes_of_other_parts_are_noted(build, weight, nees):
+    """Two pairs of nodes, with readings that count for four of them, or for two."""
+    sensors = [{"nodes": [0, 1, 2, 3], "H": np.eye(2).tolist(), "R": (R * np.eye(2)).tolist()}]
+    scenario = build(
+        horizon=6.0,
+        probe=1.0,
+        plant={"kind": "linear", "period": 1.0, "F": np.eye(2).tolist(), "Q": Q.tolist()},
+        sensors=sensors,
+        network={
+            "graph": {"kind": "edges", "nodes": 4, "edges": [[0, 1], [2, 3]]},
+            "activation": {"kind": "broadcast"},
+        },
+        filter={"kind": "hcmci", "steps": 8, **weight},
+    )
+    assert any("the graph has 2 parts" in note for note in scenario.notes) == (not weight)
+    found = netkf.monte_carlo(scenario, 400, workers=1).mean_nees[-1]
+    np.testing.assert_allclose(found, nees, rtol=0.25)
