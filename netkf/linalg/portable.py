@@ -17,6 +17,8 @@ from netkf.linalg.jacobi import diagonalise
 
 MAX_REFINED_STATES = 40
 """Largest n for which :func:`noise_root` computes its own eigenvectors instead of LAPACK's."""
+MANY = 32
+"""Length of a sum from which on terms are looked through for those that are 0."""
 SAME = 0.9
 """Smallest |cosine| between an eigenvector and that of LAPACK which it is matched with."""
 
@@ -28,10 +30,26 @@ def product(a: FloatArray, b: FloatArray) -> FloatArray:
     if a.shape[-1] == 0:
         shape = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
         return np.zeros((*shape, a.shape[-2], b.shape[-1]))
+    if min(a.shape[-2], a.shape[-1], b.shape[-1]) > MANY:
+        return _product_of_blocks(a, b)
     # + 0.0: a sum starts with 0, so that a first term of -0 gives +0.
     total: FloatArray = a[..., :, 0, None] * b[..., None, 0, :] + 0.0
     for k in range(1, a.shape[-1]):
         total += a[..., :, k, None] * b[..., None, k, :]
+    return total
+
+
+def _product_of_blocks(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return ``a b``, without the terms that are 0 because an entry is 0 in all matrices."""
+    shape = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
+    total = np.zeros((*shape, a.shape[-2], b.shape[-1]))
+    rows, columns = (np.asarray(x.any(axis=tuple(range(x.ndim - 2)))) for x in (a, b))
+    for k in range(a.shape[-1]):
+        i, j = np.flatnonzero(rows[:, k]), np.flatnonzero(columns[k])
+        if 4 * len(i) * len(j) > total.shape[-2] * total.shape[-1]:
+            total += a[..., :, k, None] * b[..., None, k, :]
+        elif len(i) and len(j):
+            total[..., i[:, None], j] += a[..., i, k, None] * b[..., None, k, j]
     return total
 
 
@@ -45,14 +63,24 @@ def apply(a: FloatArray, x: FloatArray) -> FloatArray:
         # Of one vector: fewer calls of numpy. An accumulated sum has the order of the index.
         return np.asarray(np.add.accumulate(a * x, axis=-1)[..., -1] + 0.0)
     total: FloatArray = a[..., 0] * x[..., 0, None] + 0.0
-    for k in range(1, a.shape[-1]):
+    many = range(1, a.shape[-1])
+    # Terms that are 0, as those of other blocks of a plant, change no bit of a sum.
+    used = (
+        many
+        if len(many) < MANY
+        else 1 + np.flatnonzero(x[..., 1:].any(axis=tuple(range(x.ndim - 1))))
+    )
+    for k in used:
         total += a[..., k] * x[..., k, None]
     return total
 
 
 def norm(x: FloatArray) -> FloatArray:
     """Return the Euclidean norms (...) of vectors ``x`` (..., m)."""
-    return np.asarray(np.sqrt(product(x[..., None, :], x[..., None])[..., 0, 0]))
+    if x.shape[-1] <= MANY:
+        return np.asarray(np.sqrt(product(x[..., None, :], x[..., None])[..., 0, 0]))
+    # An accumulated sum has the order of the index.
+    return np.asarray(np.sqrt(np.add.accumulate(x * x, axis=-1)[..., -1]))
 
 
 def cholesky(matrix: FloatArray) -> FloatArray:

@@ -306,11 +306,11 @@ def _completed(D: FloatArray) -> FloatArray:
     rows = np.concatenate([D, np.zeros((count, columns - n, columns))], axis=1)
     for k in range(columns):
         missing = np.flatnonzero(~rows[:, k].any(axis=1))
-        others = rows[missing]
+        others = rows if len(missing) == count else rows[missing]
         # The unit vector that is farthest from the rows so far, the first of those as far.
         left = np.round(1.0 - (others * others).sum(axis=1), 6)
         row = np.eye(columns)[np.argmax(left, axis=1)]
         for _ in range(2):
-            row = row - apply(_transposed(others), apply(others, row))
+            row = row - apply(np.swapaxes(others, 1, 2), apply(others, row))
         rows[missing, k] = row / norm(row)[:, None]
     return rows

@@ -96,6 +96,28 @@ def test_the_truth_and_the_readings_have_the_same_bits_under_other_kernels_of_op
     assert dict.fromkeys(cores, found[0]) == dict(zip(cores, found, strict=True))
 
 
+def test_terms_that_are_left_out_change_no_bit(monkeypatch):
+    """Of plants of many blocks most terms of a sum are 0; some blocks have a -0."""
+    random, count, n = np.random.default_rng(4), 3, 60
+    blocks = np.kron(np.eye(n // 4), np.ones((4, 4)))
+    a, b = (blocks * random.standard_normal((count, n, n)) for _ in range(2))
+    a[:, :2] *= -0.0
+    long = np.tile(b, (1, 1, 10)) * (random.random((count, n, 10 * n)) < 0.2)
+    b[:, :, :20] += 1.0
+
+    def results():
+        return (
+            portable.product(a, b), portable.product(a, long), portable.product(a[0], b[1]),
+            portable.apply(np.swapaxes(long, 1, 2), b[:, 3]), portable.apply(long, long[:, 5]),
+            portable.norm(long), portable.norm(long[:, 7]),
+        )  # fmt: skip
+
+    found = results()
+    monkeypatch.setattr(portable, "MANY", 10**9)
+    for mine, plain in zip(found, results(), strict=True):
+        assert mine.tobytes() == plain.tobytes()
+
+
 def test_products_are_those_of_numpy():
     random = np.random.default_rng(1)
     for shape, other in (((3, 4), (4, 2)), ((5, 1, 3), (5, 3, 2)), ((2, 5, 3, 4), (4, 4))):
