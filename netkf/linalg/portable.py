@@ -6,7 +6,7 @@ readings and the factors of their noises are computed with these.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from decimal import Decimal, localcontext
 from functools import cache
 
@@ -63,24 +63,19 @@ def apply(a: FloatArray, x: FloatArray) -> FloatArray:
         # Of one vector: fewer calls of numpy. An accumulated sum has the order of the index.
         return np.asarray(np.add.accumulate(a * x, axis=-1)[..., -1] + 0.0)
     total: FloatArray = a[..., 0] * x[..., 0, None] + 0.0
-    many = range(1, a.shape[-1])
-    # Terms that are 0, as those of other blocks of a plant, change no bit of a sum.
-    used = (
-        many
-        if len(many) < MANY
-        else 1 + np.flatnonzero(x[..., 1:].any(axis=tuple(range(x.ndim - 1))))
-    )
-    for k in used:
+    terms: Iterable[int] = range(1, a.shape[-1])
+    if a.shape[-1] > MANY:
+        # Terms that are 0, as those of other blocks of a plant, change no bit of a sum.
+        terms = 1 + np.flatnonzero(x[..., 1:].any(axis=tuple(range(x.ndim - 1))))
+    for k in terms:
         total += a[..., k] * x[..., k, None]
     return total
 
 
 def norm(x: FloatArray) -> FloatArray:
     """Return the Euclidean norms (...) of vectors ``x`` (..., m)."""
-    if x.shape[-1] <= MANY:
-        return np.asarray(np.sqrt(product(x[..., None, :], x[..., None])[..., 0, 0]))
-    # An accumulated sum has the order of the index.
-    return np.asarray(np.sqrt(np.add.accumulate(x * x, axis=-1)[..., -1]))
+    # An accumulated sum has the order of the index; that of no numbers is 0.
+    return np.asarray(np.sqrt(np.add.accumulate(x * x, axis=-1)[..., -1:].sum(axis=-1)))
 
 
 def cholesky(matrix: FloatArray) -> FloatArray:

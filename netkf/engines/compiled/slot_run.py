@@ -218,9 +218,9 @@ class SlotRuns:
             for s in setup.own_sensors
         ]
         # What is not linear is read by kernels: what a bad sensor gives instead, in each run.
-        of, when = scenario.given_readings, scenario.slot_plant.slot_time
+        given, when = scenario.given_readings, scenario.slot_plant.slot_time
         self._bad: list[tuple[AssignedSensor, list[FaultyReadings]]] = [
-            (s, [of(None, r, s.node, s.placed_sensor, when) for r in streams.per_replica])
+            (s, [given(None, r, s.node, s.placed_sensor, when) for r in streams.per_replica])
             for s in setup.nonlinear_sensors
             if scenario.fault_of(s.node, s.placed_sensor) is not None
         ]
