@@ -402,7 +402,7 @@ COMMANDS = (
                 "and simulation where the bound does not reach the target)",
                 choices=["theory", "simulation"],
             ),
-            _runs("at most this many runs per value", 1000),
+            _runs("at most this many runs per value (default: 1,000; small networks 10,000)", None),
             _confidence(0.95, "that all decisions are right"),
             *STUDY,
         ),

@@ -95,10 +95,14 @@ def expected_metrics(scenario: Scenario, seed: int, replica: int, engine: Engine
     )
 
 
+def is_small(scenario: Scenario) -> bool:
+    """Return True for few errors of all nodes: their covariance costs about a run in SimPy."""
+    return len(scenario.nodes) * scenario.width <= MAX_ERRORS
+
+
 def expected_errors_known(scenario: Scenario) -> bool:
     """Return True if ``expected_metrics`` take about as long as a few runs."""
-    errors = len(scenario.nodes) * scenario.width
-    if not scenario.is_random or errors > MAX_ERRORS:
+    if not scenario.is_random or not is_small(scenario):
         return False
     short = scenario
     if not scenario.slotted and isinstance(scenario.probe, float):

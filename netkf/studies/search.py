@@ -31,6 +31,8 @@ from netkf.studies.targets import (
 if TYPE_CHECKING:
     import pandas as pd
 
+RUNS, CHEAP_RUNS = 1000, 10_000
+"""Most runs at a value by default, and where a run takes about a millisecond."""
 FIRST_BATCH, FIRST_EXPECTED = 32, 8
 """Runs before the first decision about a value: of simulated errors, and of expected ones."""
 END_RATIO = 1.25

@@ -18,13 +18,16 @@ from netkf.studies.metrics import (
     block_metrics,
     expected_errors_known,
     expected_metrics,
+    is_small,
     join_metrics,
 )
 from netkf.studies.parameter_grid import is_integer_key
 from netkf.studies.search import (
+    CHEAP_RUNS,
     FIRST_BATCH,
     FIRST_EXPECTED,
     MAX_PROBES,
+    RUNS,
     Search,
     SimulationPlan,
     Sizing,
@@ -39,7 +42,7 @@ def size(
     high: float,
     target: str,
     by: str | None = None,
-    runs: int = 1000,
+    runs: int | None = None,
     confidence: float = 0.95,
     seed: int | None = None,
     workers: int | None = None,
@@ -57,10 +60,11 @@ def size(
     ``by`` is "theory" (a bound on the quantity, or its exact value), "simulation", or None: the
     exact value where it is known; else the bound where that reaches the target, and simulation
     where it does not. By simulation, runs are added at each value until an interval decides, at
-    most ``runs``; all values share the same random draws, and all decisions together are right with
-    probability ``confidence``. If the exact covariance of the errors given the events of a run is
-    known and cheap (small networks) it replaces the squared errors, which takes far fewer runs. The
-    quantity is assumed to be monotone in the key; that is checked at the values that are tried.
+    most ``runs`` (None: 1,000, for small networks in the compiled engine 10,000); all values share
+    the same random draws, and all decisions together are right with probability ``confidence``. In
+    SimPy, where runs are costly, the exact covariance of the errors given the events of a run
+    replaces the squared errors if it is known and the network small, which takes far fewer runs.
+    The quantity is assumed to be monotone in the key; that is checked at the values that are tried.
 
     ``seed``, ``workers``, ``executor``, ``scheduler`` and ``engine`` are those of
     ``netkf.monte_carlo``; ``progress`` is called with a line of text as simulations go on. Raises
@@ -72,13 +76,16 @@ def size(
         one_of("theory", "simulation")("--by", by)
     parsed = parse_target(target)
     confidence = number(above=0.0, below=1.0)("--confidence", confidence)
-    require_runs(runs, FIRST_BATCH, "--runs")
     if parsed.of_errors and not scenario.plant.truth_known:
         rule = "is about errors, and there is no ground truth"
         raise ScenarioError("--target", rule, target, "ask for mean_trace or worst_trace")
     base = parsed.prepare(scenario if seed is None else scenario.replace({"seed": seed}))
     is_integer = _check_range(base, key, low, high)
     engine_used = choose_engine(engine, base.replace({key: low}))
+    cheap = engine_used.name == "compiled" and is_small(base)
+    most = require_runs(
+        (CHEAP_RUNS if cheap else RUNS) if runs is None else runs, FIRST_BATCH, "--runs"
+    )
     chosen = by or _choose_method(base, key, (low, high), parsed)
     search = Search(base, key, is_integer, parsed, chosen)
     if chosen == "theory":
@@ -90,7 +97,7 @@ def size(
     task: BlockTask = partial(block_metrics, engine=engine_used)
     first = FIRST_BATCH
     # Expected squared errors vary less from run to run than squared errors: fewer runs suffice.
-    if parsed.of_errors and expected_errors_known(search.at(low)):
+    if parsed.of_errors and not cheap and expected_errors_known(search.at(low)):
         expected = partial(expected_metrics, engine=engine_used)
         task, first = partial(each_replica, expected, join_metrics), FIRST_EXPECTED
         quantity += ", each with its exact expected squared error given its events"
@@ -98,10 +105,10 @@ def size(
         bound = quantity_by_theory(search.at(low), parsed)[1]
         quantity = f"{bound}; where that is above the limit, simulated: {quantity}"
     # Bonferroni over all values and all looks at each of them while its runs are doubled.
-    looks = 1 + math.ceil(math.log2(max(1.0, runs / first)))
+    looks = 1 + math.ceil(math.log2(max(1.0, most / first)))
     level = (1.0 - confidence) / (MAX_PROBES["simulation"] * looks)
-    with make_pool(runs, PoolOptions(workers, executor, scheduler), open_ended=True) as pool:
-        plan = SimulationPlan(task, runs, level, pool, progress, first)
+    with make_pool(most, PoolOptions(workers, executor, scheduler), open_ended=True) as pool:
+        plan = SimulationPlan(task, most, level, pool, progress, first)
         return dataclasses.replace(search, plan=plan).run(low, high, confidence, quantity)
 
 
