@@ -7,14 +7,14 @@ it: there the truth, its readings and all that filters do are those of the plant
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import apply
-from netkf.plants.readings import covariance_of, read_many
+from netkf.plants.readings import covariance_of, read_many, readings_of
 from netkf.plants.response import Response
 
 
@@ -202,6 +202,13 @@ class MovedReadings:
     def covariance(self, k: int, R: FloatArray) -> FloatArray:
         """Return the covariance of reading number ``k``, see ``covariance_of``."""
         return covariance_of(self._path, k, R)
+
+    def parts(self, slot: int, x: FloatArray, R: FloatArray) -> Iterator[Any]:
+        """Yield y, H and covariance of each reading of a slot, see ``readings_of``."""
+        m = self._m([slot])[0]
+        for y, H, covariance in readings_of(self._path, slot, x + m, R):
+            is_linear = isinstance(H, np.ndarray)
+            yield _moved(y, H, m), H if is_linear else MovedFunction(H, m), covariance
 
     def readings_at(self, slot: int, R: FloatArray) -> Any:
         """Return the readings of a nonlinear sensor in a slot, which no origin changes."""

@@ -349,6 +349,15 @@ class RecordedReadings:
             whole[np.ix_(present, present)] = self._rows.covariance(k, R)
             yield y, int(self._rows.anchors[k]), whole
 
+    def parts(
+        self, slot: int, x: FloatArray, R: FloatArray
+    ) -> Iterator[tuple[FloatArray, Any, FloatArray]]:
+        """Yield the values (p',) of each row of a slot, their H or a function, and covariance."""
+        for k in self._slots.get(slot, ()):
+            present = np.isfinite(self._rows.y[k])
+            covariance = self._rows.covariance(k, R)
+            yield self._rows.y[k][present], self._matrix(k, present), covariance
+
     def covariance(self, slot: int, R: FloatArray) -> FloatArray:
         """Return the noise covariance (p', p') in slot number ``slot``, from R (p, p)."""
         return block_diagonal([self._rows.covariance(k, R) for k in self._slots.get(slot, ())])
@@ -366,7 +375,8 @@ class RecordedReadings:
         self, slots: Sequence[int], R: FloatArray, p: int
     ) -> tuple[FloatArray, FloatArray]:
         """Return readings (S, p) and matrices (S, p, n) of S ``slots``, multiplied by the inverse
-        Cholesky factor of their noise covariance, where a sensor has R; zeros for what is missing.
+        Cholesky factor of their noise covariance, where a sensor has R; zeros for what is missing,
+        at the end of each row of the table: gates look at each by itself.
         """
         if self._whitened is None:
             self._whitened = self._whiten(R)
@@ -377,7 +387,7 @@ class RecordedReadings:
                 values, matrix = self._whitened[k]
                 y[index, row : row + len(values)] = values
                 H[index, row : row + len(values)] = matrix
-                row += len(values)
+                row += self._rows.y.shape[1]
         return y, H
 
     def _whiten(self, R: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
@@ -442,6 +452,18 @@ def covariance_of(path: Any, k: int, R: FloatArray) -> FloatArray:
     """Return the covariance of reading number ``k``: its own, or the R (p, p) of the sensor."""
     covariance = getattr(path, "covariance", None)
     return R if covariance is None else np.asarray(covariance(k, R))
+
+
+def readings_of(
+    path: Any, slot: int, x: FloatArray, R: FloatArray
+) -> Iterator[tuple[FloatArray, Any, FloatArray]]:
+    """Yield y (p,), H (p, n) or a function, and the noise covariance (p, p) of each reading of a
+    ``slot``, at the state x (n,), of a sensor with R (p, p): a table may have several.
+    """
+    if hasattr(path, "parts"):
+        yield from path.parts(slot, x, R)
+    else:
+        yield path.reading(slot, x), path.matrix(slot), covariance_of(path, slot, R)
 
 
 def read_many(path: Any, numbers: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -371,3 +371,35 @@ def test_readings_of_pairs_in_messages_pass(tmp_path):
     run, other = (netkf.simulate(one, engine="simpy") for one in (scenario, gated))
     assert run.fingerprint == other.fingerprint
     np.testing.assert_array_equal(run.xhat, other.xhat)
+
+
+@pytest.mark.parametrize("then", ["ignore", "inflate"])
+@pytest.mark.parametrize("sensor", ["recorded", "range-bearing"])
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_each_row_of_a_table_passes_by_itself_in_slots(tmp_path, engine, sensor, then):
+    # Several readings of one slot are those of as many sensors with one each; the plant is driven,
+    # so that readings are of states that are counted from its response.
+    rng = np.random.default_rng(6)
+    rows = [[f"{k}.0,1", rng.normal(2.0, 1.5, 2).tolist()] for k in range(12) for _ in range(3)]
+    rows[4][1][1] = rows[9][1][0] = ""
+    tables = {"all": rows, **{f"row{m}": rows[m::3] for m in range(3)}}
+    for name, some in tables.items():
+        lines = [f"{stamp},{y[0]},{y[1]}" for stamp, y in some]
+        (tmp_path / f"{name}.csv").write_text("\n".join(["t,node,y0,y1", *lines]) + "\n")
+    head, tail = SLOTS.partition("[[sensors]]")[0], SLOTS.partition("[network]")[2]
+    head += 'input = {{ kind = "constant", value = 0.3, G = [[1.0], [0.0]] }}\n'
+    H = "H = [[1.0, 0.0], [0.0, 1.0]]" if sensor == "recorded" else "positions = [[4.0, 4.0]]"
+
+    def simulate(names):
+        one = f'[[sensors]]\nkind = "{sensor}"\nnodes = [1]\n{H}\nR = [[0.5, 0.1], [0.1, 0.4]]\n'
+        text = head + "".join(f'{one}path = "{name}.csv"\n' for name in names) + "[network]" + tail
+        path = tmp_path / "rows.toml"
+        gate = f'probability = 0.8, then = "{then}"'
+        path.write_text(text.format(gate=gate, horizon=12.0))
+        return netkf.simulate(netkf.load(path), engine=engine)
+
+    together, apart = simulate(["all"]), simulate(["row0", "row1", "row2"])
+    np.testing.assert_allclose(together.xhat, apart.xhat, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(together.P, apart.P, rtol=1e-9, atol=1e-12)
+    assert together.fingerprint == apart.fingerprint
+    assert 5 < together.count("refuse") < 30

@@ -65,7 +65,8 @@ def with_refusals(
         made[name] = -1
     made["t"], made["kind"], made["age"] = now[known], REFUSE, np.nan
     nodes = np.full(1, -1) if setup.algorithm.timing.pooled else setup.nodes
-    made["node"] = nodes[np.array([s.estimator for s in setup.assigned])[parts[known]]]
+    counts = [len(parts) for parts in setup.gated_parts]
+    made["node"] = np.repeat(nodes, counts)[parts[known]]
     places = read[last[known] - 1] + 1
     return insert_rows(rows, places, made, before_sample)
 

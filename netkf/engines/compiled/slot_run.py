@@ -292,7 +292,7 @@ class SlotRuns:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Simulate the filters; return ``refused`` and ``clipped`` of ``SlotPlan``."""
         filters, count, (y, H, rebased) = self._filters, len(times.start), readings
-        gated = len(self.setup.assigned) if self.setup.gate is not None else 0
+        gated = sum(map(len, self.setup.gated_parts)) if self.setup.gate is not None else 0
         unread, begin = self._missed_readings(messages, count), WHOLE
         speaks = self._find_senders(times, messages, unread)
         drawn: dict[str, Any] = {

@@ -187,11 +187,12 @@ class SlotSetup:
 
     @cached_property
     def gated_parts(self) -> list[list[tuple[int, int]]]:
-        """First row and number of rows of each sensor of each filter."""
-        return [
-            [(s.row, s.rows) for s in self.assigned if s.estimator == h]
-            for h in range(self.estimators)
-        ]
+        """First row and number of rows of each reading of each filter: a table may have several."""
+        parts: list[list[tuple[int, int]]] = [[] for _ in range(self.estimators)]
+        for s in self.assigned:
+            p = len(s.R)
+            parts[s.estimator] += [(row, p) for row in range(s.row, s.row + s.rows, p)]
+        return parts
 
     def _set_pairs(self, pairs: SlotPairs, scenario: Scenario) -> np.ndarray:
         """Put readings of pairs behind those of own states; return how many rows these have."""

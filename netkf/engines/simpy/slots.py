@@ -23,7 +23,7 @@ from netkf.linalg.arrays import FloatArray, block_diagonal
 from netkf.network.channels import senders_of_pairs
 from netkf.network.matchings import used_links
 from netkf.plants.linear import Readings
-from netkf.plants.readings import covariance_of
+from netkf.plants.readings import readings_of
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
@@ -296,9 +296,9 @@ class Reader:
                     # In the coordinates of the estimates, as H x is.
                     x = truth.local(slot)
                     for sensor, R in sensors:
-                        y, H = sensor.reading(slot, x), sensor.matrix(slot)
-                        if up:
-                            self._carrier.read(y, H, covariance_of(sensor, slot, R))
+                        for reading in readings_of(sensor, slot, x, R):
+                            if up:
+                                self._carrier.read(*reading)
             slot += 1
 
 
