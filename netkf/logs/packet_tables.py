@@ -117,9 +117,11 @@ def read_tables(log: Path, columns: Mapping[str, str]) -> PacketLog:
     result = PacketLog(sends, outcomes, origin, resolution, "lost", notes, is_run=is_run)
     if is_run and (log / "ticks.csv").is_file():
         result.ticks = log / "ticks.csv"
-    if (table["what"] == "outcome").all() and (table["heard"] == 0.0).any():
+    if is_export:
+        result.absent = "unsent"
+    elif (table["what"] == "outcome").all() and (table["heard"] == 0.0).any():
         # The log says itself what was lost.
-        result.absent = "unsent" if is_export else "unknown"
+        result.absent = "unknown"
     if extras["positions"] is not None:
         result.positions = read_positions(extras["positions"], origin, notes)
     if extras["readings"] is not None:

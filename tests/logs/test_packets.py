@@ -508,8 +508,9 @@ SOME_LINKS = {
 }
 
 
+@pytest.mark.parametrize("delivery", [0.6, 1.0])
 @pytest.mark.parametrize("name", SOME_LINKS)
-def test_of_a_run_nothing_is_taken_to_be_sent_over_a_link_that_is_down(name, tmp_path):
+def test_of_a_run_nothing_is_taken_to_be_sent_over_a_link_that_is_down(name, delivery, tmp_path):
     """Nodes send at one instant, now to these and now to those: numbers of directions differ."""
     rows = ["from,until,node,peer", "0,3,0,1", "2,6,1,2", "5,9,0,2"]
     write(tmp_path / "contacts.csv", rows)
@@ -522,7 +523,7 @@ def test_of_a_run_nothing_is_taken_to_be_sent_over_a_link_that_is_down(name, tmp
     else:
         graph = {"kind": "range", "nodes": 3, "radius": 1.6}
         network = {"graph": graph, "positions": "places.csv"}
-    loss = {"kind": "bernoulli", "delivery": 0.6}
+    loss = {"kind": "bernoulli", "delivery": delivery}
     network |= {"activation": activation, "channel": {"loss": loss, "symmetric": False}}
     sensor = {"nodes": [0, 1, 2], "H": [[1.0]], "R": [[0.5]]}
     plant = {"kind": "linear", "F": [[0.9]], "Q": [[0.2]], "period": 1.0}
