@@ -465,7 +465,7 @@ class BeliefPropagation(Filter):
         """Raise ScenarioError where messages that are kept depend on each other, or lose digits."""
         if scenario.slotted and self.memory == SLOT:
             return
-        key, (A, Q) = "Q" if scenario.slotted else "B", scenario.believed_pieces[0]
+        key, (A, Q) = "Q" if scenario.slotted else "B", scenario.estimated_pieces[0][0]
         # Process noise that two messages share would count as independent evidence.
         if Q.any():
             slots = 'memory = "slot"'

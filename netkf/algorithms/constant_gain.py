@@ -221,7 +221,7 @@ class ConstantGain(Filter):
                     "recorded",
                     "use linear sensors, slots, or another filter",
                 )
-        nodes, n = scenario.nodes, scenario.plant.n
+        nodes, n = scenario.nodes, scenario.width
         if isinstance(self.gain, tuple) and len(self.gain) != len(nodes):
             rule = f"must be one matrix, or one for each of {len(nodes)} nodes"
             raise ScenarioError(

@@ -635,7 +635,7 @@ class PushSum(Filter):
         check_information(scenario)
         # P (12) may have no solution, as for an unstable plant that the sensors do not see.
         if self.asymptotic:
-            F, Q = scenario.believed_pieces[0]
+            F, Q = scenario.estimated_pieces[0][0]
             self._check_limit(F, Q, scenario.node_infos[0].information)
 
     def _check_limit(self, F: FloatArray, Q: FloatArray, information: FloatArray) -> None:

@@ -48,14 +48,17 @@ def _information_condition(scenario: Any) -> float:
     """Return the largest condition of ``I + S' G S`` over the nodes of a scenario in slots."""
     if not scenario.slotted or not scenario.plant.linear:
         return 1.0
-    F, Q = scenario.believed_pieces[0]
     try:
         pairs = [
             scenario.observation_matrices(node, believed=True) for node in scenario.sensing_nodes
         ]
     except TheoryError:
         return 1.0
-    G = sum((H.T @ np.linalg.solve(R, H) for H, R in pairs), np.zeros(Q.shape))
+    n = scenario.plant.n
+    # Such filters estimate one state at all nodes.
+    G = sum((H.T @ np.linalg.solve(R, H) for H, R in pairs), np.zeros((n, n)))
+    G = scenario.seen_part(0, G)
+    F, Q = scenario.estimated_pieces[0][0]
     covs = {cov.tobytes(): cov for _, cov in map(scenario.initial_estimate, scenario.nodes)}
     largest = 1.0
     for cov in covs.values():

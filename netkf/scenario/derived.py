@@ -155,6 +155,20 @@ class DerivedScenario(ScenarioModel):
         )
 
     @cached_property
+    def estimated_pieces(self) -> tuple[tuple[tuple[FloatArray, FloatArray], ...], ...]:
+        """The ``believed_pieces`` of what each node estimates; once if all estimate all."""
+        nodes = range(1 if self.views is None else len(self.nodes))
+        return tuple(
+            tuple((self.seen_part(k, F), self.seen_part(k, Q)) for F, Q in self.believed_pieces)
+            for k in nodes
+        )
+
+    def seen_part(self, k: int, M: FloatArray) -> FloatArray:
+        """Return the rows and columns (n', n') of M (n, n) that node number ``k`` estimates."""
+        view = self.view(k)
+        return np.ascontiguousarray(M[view][:, view])
+
+    @cached_property
     def model_pieces(self) -> tuple[tuple[Any, ...], ...]:
         """The models of all nodes, or of a pooled filter, in each of ``believed_pieces``."""
         pooled, names = self.node_filter.timing.pooled, "FQ" if self.slotted else "AQ"
@@ -347,7 +361,8 @@ class DerivedScenario(ScenarioModel):
         return tuple(
             NodeInfo(
                 node, degrees[node], len(receivers(node)), len(self.nodes), own_weights[node],
-                total_information, max_delay, k, senders(node), network, most_rows,
+                self.seen_part(k, total_information), max_delay, k, senders(node), network,
+                most_rows,
                 self._own_sensors(k, sampled.get(node, ())), places[node],
                 self._is_alone(k, counts), whole,
                 tuple(places[i] for i in senders(node)),
@@ -397,7 +412,9 @@ class DerivedScenario(ScenarioModel):
         for sender, receiver in self.topology.directions:
             senders[receiver].append(self.topology.index[sender])
         sender_indices = tuple(tuple(sorted(senders[node])) for node in self.nodes)
-        return NetworkInfo(np.stack(self.informations), sender_indices)
+        # Such filters estimate one state at all nodes.
+        informations = np.stack([self.seen_part(0, G) for G in self.informations])
+        return NetworkInfo(informations, sender_indices)
 
     @cached_property
     def diffusion(self) -> Diffusion:

@@ -240,21 +240,23 @@ def _check_common_start(scenario: DerivedScenario) -> None:
 
 
 def _check_invertible(scenario: DerivedScenario) -> None:
-    n = scenario.plant.n
     initial = {node: scenario.initial_estimate(node)[1] for node in scenario.nodes}
     singular = next((node for node, P in initial.items() if not bool(is_definite(P))), None)
+    linear, of_nodes = scenario.plant.linear, scenario.estimated_pieces
     if scenario.slotted:
         nonsingular = all(
             bool(is_definite(Q))
-            or (singular is None and (not scenario.plant.linear or np.linalg.matrix_rank(F) == n))
-            for F, Q in scenario.believed_pieces
+            or (singular is None and (not linear or np.linalg.matrix_rank(F) == len(F)))
+            for pieces in of_nodes
+            for F, Q in pieces
         )
-    elif not scenario.plant.linear:
-        nonsingular = singular is None or bool(is_definite(scenario.believed_pieces[0][1]))
+    elif not linear:
+        nonsingular = singular is None or all(bool(is_definite(Q)) for ((_, Q), *_) in of_nodes)
     else:
-        A, Q = scenario.believed_pieces[0]
         # (A, Q) is controllable if and only if (A', Q) is observable.
-        nonsingular = singular is None or hidden_mode(A.T, outputs_of(Q)) is None
+        nonsingular = singular is None or all(
+            hidden_mode(A.T, outputs_of(Q)) is None for ((A, Q), *_) in of_nodes
+        )
     if not nonsingular:
         value = "a singular F"
         if singular is not None:

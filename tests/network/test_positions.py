@@ -10,6 +10,7 @@ import pytest
 import scipy.stats
 
 import netkf
+from netkf.checks.records.events import event_fault
 from netkf.core.errors import NetkfError, TheoryError
 from netkf.network.losses import DistanceLoss, Transmission
 from netkf.rng.streams import Streams
@@ -17,6 +18,7 @@ from netkf.scenario.reading import from_table, parse_toml
 from netkf.scenario.usage import record_usage
 from netkf.scenario.writing import as_table, resolve_defaults, to_toml
 from netkf.theory.errors import error_covariance, error_law
+from netkf.theory.promises import compute_promises, promises_text
 from netkf.trace.schema import CODES
 from tests.engines.agreement import assert_agree
 from tests.reference import kalman_update
@@ -336,6 +338,44 @@ def test_summary_counts_components(tmp_path, source, clock):
     assert entry["connected"] == pytest.approx(np.mean([c == 1 for c in counts]), abs=1e-12)
     found = {(row["node"], row["peer"]): row["up"] for row in entry["links"]}
     assert found == pytest.approx({link: k / 31 for link, k in ups.items()}, abs=1e-12)
+
+
+@pytest.mark.parametrize("clock", CLOCKS)
+def test_messages_in_range_are_no_fault_of_the_record(tmp_path, clock):
+    positions = MOVING.replace("10,3,1,1", "10,3,20,20")
+    graph = RANGE | {"radius": 5.5}
+    moving = scenario(tmp_path, clock, graph=graph, positions=positions)
+    run = netkf.simulate(moving)
+    assert len(rows(run, "send")) > 0
+    assert event_fault(moving, run) == ""
+
+
+@pytest.mark.parametrize("clock", ["nodes", "broadcast"])
+@pytest.mark.parametrize("kind", ["drawn", "recorded", "unknown"])
+def test_a_target_beside_robots_that_links_follow(tmp_path, clock, kind):
+    """Nodes estimate the target, and summaries and promises know that the robots matter."""
+    given = robots(clock)
+    plant, dynamics = dict(given["plants"][0]), SLOTS if clock in SLOTTED else FLOW
+    if kind == "recorded":
+        lines = [f"{t},{i},{i},{t}" for t in range(32) for i in range(4)]
+        (tmp_path / "poses.csv").write_text("t,node,x0,x1\n" + "\n".join(lines))
+        plant |= {"kind": kind, "path": "poses.csv"} | (
+            {} if clock in SLOTTED else {"interpolate": "linear"}
+        )
+    if kind == "unknown":
+        del plant["position"]
+        plant["kind"] = kind
+    target = {k: v for k, v in dynamics.items() if k != "kind"} | {"name": "target"}
+    sensors = [{**given["sensors"][0], "of": "target", "H": [[1.0]]}]
+    graph = {"kind": "path", "nodes": 4} if kind == "unknown" else RANGE
+    more = {"plants": [plant, target], "sensors": sensors}
+    filtering = {**FILTERS.get(clock, {"kind": "hybrid", "epsilon": 0.3}), "estimates": "shared"}
+    one = scenario(tmp_path, clock, {"kind": "none"}, graph, **more, filter=filtering)
+    netkf.save(run := netkf.simulate(one), one, tmp_path / "run")
+    assert run.xhat.shape[-1] == 1
+    assert "central filter of all blocks" in promises_text(one, compute_promises(one))
+    with pytest.raises(TheoryError, match="not drawn or that links follow"):
+        netkf.theory.covariance_bound(one, run.times)
 
 
 def test_intermittent_filter_by_hand(tmp_path):

@@ -262,3 +262,52 @@ def test_blocks_that_all_estimate_are_a_plant_of_their_own(tmp_path: Path) -> No
     np.testing.assert_allclose(covariance_bound(shared, times), expected, rtol=1e-12)
     one, other = (compute_promises(scenario) for scenario in (alone, shared))
     assert one == other
+
+
+FIXED = """
+format = 1
+name = "a target in slots"
+probe = 1.0
+horizon = 6.0
+[plant]
+kind = "linear"
+F = [[0.9, 0.2], [-0.1, 0.8]]
+Q = [[0.1, 0.0], [0.0, 0.1]]
+period = 1.0
+cov = [[1.0, 0.0], [0.0, 1.0]]
+[[sensors]]
+nodes = [1, 2]
+H = [[1.0, 0.5]]
+R = [[0.1]]
+[network]
+graph = { kind = "edges", edges = [[1, 2]] }
+activation = { kind = "broadcast" }
+"""
+IN_SLOTS = (
+    'kind = "hcmci"', 'kind = "icf"', 'kind = "consensus-innovations"', 'kind = "kcf"',
+    'kind = "track-fusion"\nrule = "cross-covariance"', 'kind = "belief-propagation"',
+    'kind = "push-sum"\ngamma = 1\ndelta = 4.0\nleader = 1',
+    'kind = "push-sum"\ngamma = 1\ndelta = 4.0\nleader = 1\nasymptotic = true',
+    'kind = "constant-gain"\ngain = [[0.5], [0.1]]', 'kind = "diffusion"',
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("filtering", IN_SLOTS)
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_filters_of_a_shared_block_do_not_see_other_blocks(
+    tmp_path: Path, filtering: str, engine: str
+) -> None:
+    """Neither does what they compute, or refuse, before there are readings: here the others know
+    where they begin, and their F is 0.
+    """
+    (tmp_path / "alone.toml").write_text(FIXED + f"[filter]\n{filtering}\n")
+    still = 'F = [[0.0]]\nQ = [[0.0]]\nperiod = 1.0\nnodes = [1, 2]\nname = "pose"\n'
+    blocks = FIXED.replace(
+        '[plant]\nkind = "linear"', f'[[plants]]\n{still}[[plants]]\nname = "target"'
+    )
+    blocks = blocks.replace("[[sensors]]", '[[sensors]]\nof = "target"')
+    (tmp_path / "blocks.toml").write_text(blocks + f'[filter]\n{filtering}\nestimates = "shared"\n')
+    alone, shared = (netkf.load(tmp_path / f"{name}.toml") for name in ("alone", "blocks"))
+    one, other = (netkf.simulate(scenario, engine=engine) for scenario in (alone, shared))
+    np.testing.assert_allclose(other.P, one.P, rtol=1e-9, atol=1e-12)
+    assert compute_promises(alone)["assumptions"] == compute_promises(shared)["assumptions"]

@@ -302,8 +302,11 @@ def _caused(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
     else:
         expected = np.array([receivers[node] for node in log["node"][causes].tolist()], dtype=int)
     counts = np.bincount(block, minlength=len(causes))
-    # A link of which neither end sends anything is silent by design; half an exchange is not.
-    if (k := _first((counts != expected) & (counts > 0))) is not None:
+    # A link of which neither end sends anything is silent by design; half an exchange is not. A
+    # broadcast goes to those in range.
+    in_range = not by_link and scenario.topology.radius is not None
+    wrong = counts > expected if in_range else (counts != expected) & (counts > 0)
+    if (k := _first(wrong)) is not None:
         yield f"{_describe(log, int(causes[k]))} sends {counts[k]} messages, not {expected[k]}"
 
 

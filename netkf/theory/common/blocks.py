@@ -20,9 +20,13 @@ MATRICES = ("A", "B", "F", "Q", "G", "H", "mean", "cov")
 
 
 def have_one_view(scenario: Scenario) -> bool:
-    """Return True if all nodes estimate the same blocks, but not all there are."""
+    """Return True if all nodes estimate the same blocks, but not all there are, and the others may
+    be left out: all are drawn, and links do not follow them.
+    """
     views = scenario.views
-    return views is not None and all(np.array_equal(views[0], view) for view in views)
+    if views is None or not scenario.plant.is_random or scenario.links_follow_state:
+        return False
+    return all(np.array_equal(views[0], view) for view in views)
 
 
 @lru_cache(maxsize=8)

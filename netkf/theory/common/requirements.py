@@ -49,14 +49,17 @@ def topology_of(graph: object) -> Topology:
 
 def scenario_of_estimates(scenario: Scenario) -> Scenario:
     """Return a scenario whose nodes estimate the whole state, that of the blocks of all nodes;
-    raises TheoryError if these are different ones.
+    raises TheoryError if there is none (:func:`have_one_view`).
     """
     if scenario.views is None:
         return scenario
     if have_one_view(scenario):
         return scenario_of_view(scenario)
     known = "; of these are known theory.central_covariance and theory.error_covariance"
-    reason = "not known of nodes that estimate different blocks of the state"
+    reason = (
+        "not known of nodes that estimate different blocks of the state, or blocks beside others "
+        "that are not drawn or that links follow"
+    )
     raise TheoryError(reason + (known if scenario.is_linear else ""))
 
 

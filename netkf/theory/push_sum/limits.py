@@ -11,7 +11,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, symmetric
 from netkf.network.graphs import Topology
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.requirements import topology_of
+from netkf.theory.common.requirements import scenario_of_estimates, topology_of
 from netkf.theory.intermittent.riccati import filtered_covariance
 
 
@@ -48,6 +48,7 @@ def push_sum_limits(scenario: Scenario) -> PushSumLimits:
     sensors whose H varies, and for scenarios without the push-sum filter.
     """
     push_sum_filter(scenario)
+    scenario = scenario_of_estimates(scenario)
     if any(sensor.varying for sensor in scenario.sensors):
         raise TheoryError(
             "the sensors' H differs from slot to slot: their information has no limit"
