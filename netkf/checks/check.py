@@ -139,8 +139,11 @@ def find_checks(scenario: Scenario) -> PaperChecks:
     """Return the checks of the paper of a scenario's filter; raises TheoryError without one."""
     if not scenario.is_linear:
         return WITHOUT_PAPER
-    # Papers are about plants that do not change and are drawn; the equations hold for all.
-    if len(scenario.plant.changes) or not scenario.is_random or scenario.network.lives:
+    # Papers are about plants that do not change, are drawn and are estimated whole; the equations
+    # hold for all.
+    whole = scenario.views is None or have_one_view(scenario)
+    changes = len(scenario.plant.changes) or not scenario.is_random or scenario.network.lives
+    if changes or not whole:
         return UNDER_CLOCKS
     promised = promised_filter(scenario.filter.algorithm)
     # Without messages the equations of a Kalman filter are all that is promised.

@@ -350,7 +350,7 @@ def test_messages_in_range_are_no_fault_of_the_record(tmp_path, clock):
     assert event_fault(moving, run) == ""
 
 
-@pytest.mark.parametrize("clock", ["nodes", "broadcast"])
+@pytest.mark.parametrize("clock", ["nodes", "broadcast", "matching"])
 @pytest.mark.parametrize("kind", ["drawn", "recorded", "unknown"])
 def test_a_target_beside_robots_that_links_follow(tmp_path, clock, kind):
     """Nodes estimate the target, and summaries and promises know that the robots matter."""
@@ -376,6 +376,8 @@ def test_a_target_beside_robots_that_links_follow(tmp_path, clock, kind):
     assert "central filter of all blocks" in promises_text(one, compute_promises(one))
     with pytest.raises(TheoryError, match="not drawn or that links follow"):
         netkf.theory.covariance_bound(one, run.times)
+    if kind == "drawn":
+        assert netkf.check(one, runs=10, workers=1)
 
 
 def test_intermittent_filter_by_hand(tmp_path):
