@@ -214,7 +214,7 @@ def draw_map_paths(
 
 
 class SlotSensors(NamedTuple):
-    """M sensors whose readings are drawn from the model; p is the largest number of rows.
+    """M sensors whose readings are drawn from the model; p is the most rows of one of them.
 
     estimator (M,) index of the filter that uses the readings of the sensor, that of its node or the
               one that all nodes share

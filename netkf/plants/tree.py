@@ -22,7 +22,7 @@ from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.local import local_vector
 from netkf.linalg.portable import apply, norm, product
-from netkf.linalg.structs import Size, sized
+from netkf.linalg.structs import MAX_UNROLLED, Size, sized
 from netkf.plants.transitions import Transitions, noise_factors
 from netkf.rng.numbers import NormalZiggurat, first_normals, normal_ziggurat
 from netkf.rng.streams import BLOCK_WORDS, USED
@@ -52,6 +52,8 @@ class Cells(NamedTuple):
     Phi : (C, n, n), transposed, of the first part
     middle : (C, 2 n, n), transposed, the effect of [z; w] on the state at the end of the first part
     inner : (C, 2, 2 n, n), transposed, the effect of [z; w] on the normals of each part
+    of_v, of_x : (C, 2 n, 2), (C, n, 2), first state and end of those that an entry of [z; w], or of
+        the state, has an effect on: of many blocks most have none on each other
     knot_Phi, knot_L : (n, n), transposed, of the largest cell, between two knots
     """
 
@@ -64,6 +66,8 @@ class Cells(NamedTuple):
     Phi: FloatArray
     middle: FloatArray
     inner: FloatArray
+    of_v: IntArray
+    of_x: IntArray
     knot_Phi: FloatArray
     knot_L: FloatArray
 
@@ -252,20 +256,28 @@ def divide_cell(size: Size, cells: Cells, walk: Walk, depth: int) -> None:
         x[i] = z[i] = 0.0
     for j in range(2 * n):
         v = walk.v[depth, j]
-        for i in range(n):
+        for i in range(*_span(size, cells.of_v, kind, j)):
             z[i] += cells.inner[kind, part, j, i] * v
     if part == 1:
         for j in range(n):
             v = walk.x[depth, j]
-            for i in range(n):
+            for i in range(*_span(size, cells.of_x, kind, j)):
                 x[i] += cells.Phi[kind, j, i] * v
         for j in range(2 * n):
             v = walk.v[depth, j]
-            for i in range(n):
+            for i in range(*_span(size, cells.of_v, kind, j)):
                 x[i] += cells.middle[kind, j, i] * v
     for i in range(n):
         walk.x[inner, i] = x[i] if part == 1 else walk.x[depth, i]
         walk.v[inner, i] = z[i]
+
+
+@kernel(inlined=True)
+def _span(size: Size, spans: IntArray, kind: int, j: int) -> tuple[int, int]:
+    """Return ``spans[kind, j]``; of few states all, as loops over them are unrolled."""
+    if len(size) <= MAX_UNROLLED:
+        return 0, len(size)
+    return spans[kind, j, 0], spans[kind, j, 1]
 
 
 def _cells(moves: Transitions, digits: int, decades: int, first_level: int) -> Cells:
@@ -280,6 +292,9 @@ def _cells(moves: Transitions, digits: int, decades: int, first_level: int) -> C
     knot_Phi, knot_L = moves.laws(np.array([10.0**decades / tick]))
     kinds = {1: -1, 2: 0, 3: 1, 5: 2}  # of the parts of the four kinds, after those of a decade
     left, right = (np.array([kinds[m] for m in parts])[share] for parts in (LEFT, RIGHT))
+    Phi = _transposed(Phi_1)
+    middle = np.ascontiguousarray(product(turn[:, :, :n], _transposed(L_1)))
+    inner = np.ascontiguousarray(np.stack([turn[:, :, :n], turn[:, :, n:]], axis=1))
     return Cells(
         length=np.array(SHARES)[share] * unit,
         before=before,
@@ -287,12 +302,21 @@ def _cells(moves: Transitions, digits: int, decades: int, first_level: int) -> C
         parts=np.stack([np.maximum(4 * exponent + part, -1) for part in (left, right)], axis=1),
         level=exponent - digits + LEVELS + first_level,
         knot_level=first_level - 1,
-        Phi=_transposed(Phi_1),
-        middle=np.ascontiguousarray(product(turn[:, :, :n], _transposed(L_1))),
-        inner=np.ascontiguousarray(np.stack([turn[:, :, :n], turn[:, :, n:]], axis=1)),
+        Phi=Phi,
+        middle=middle,
+        inner=inner,
+        of_v=_spans((inner != 0.0).any(axis=1) | (middle != 0.0)),
+        of_x=_spans(Phi != 0.0),
         knot_Phi=_transposed(knot_Phi)[0],
         knot_L=_transposed(knot_L)[0],
     )
+
+
+def _spans(used: np.ndarray) -> IntArray:
+    """Return the first place and the end (C, r, 2) of the rows of flags ``used`` (C, r, n)."""
+    n, some = used.shape[-1], used.any(axis=2)
+    ends = np.where(some, n - used[:, :, ::-1].argmax(axis=2), 0)
+    return np.stack([np.where(some, used.argmax(axis=2), 0), ends], axis=2)
 
 
 def _transposed(matrices: FloatArray) -> FloatArray:
@@ -304,13 +328,16 @@ def _completed(D: FloatArray) -> FloatArray:
     """Return orthogonal matrices (C, 2 n, 2 n) whose first rows are ``D`` (C, n, 2 n)."""
     count, n, columns = D.shape
     rows = np.concatenate([D, np.zeros((count, columns - n, columns))], axis=1)
+    taken = (rows * rows).sum(axis=1)
     for k in range(columns):
         missing = np.flatnonzero(~rows[:, k].any(axis=1))
         others = rows if len(missing) == count else rows[missing]
         # The unit vector that is farthest from the rows so far, the first of those as far.
-        left = np.round(1.0 - (others * others).sum(axis=1), 6)
+        left = np.round(1.0 - taken[missing], 6)
         row = np.eye(columns)[np.argmax(left, axis=1)]
         for _ in range(2):
             row = row - apply(np.swapaxes(others, 1, 2), apply(others, row))
-        rows[missing, k] = row / norm(row)[:, None]
+        row /= norm(row)[:, None]
+        rows[missing, k] = row
+        taken[missing] += row * row
     return rows

@@ -200,9 +200,10 @@ def _check_speed(scenario: DerivedScenario) -> None:
     # A message with a fixed delay is predicted over the delay, which may exceed the horizon.
     longest = max(scenario.horizon, delay)
     believed = scenario.believed_pieces  # A and B B' that the filters assume
-    linear_sensors = [sensor for sensor in scenario.sensors if sensor.linear]
-    informations = [sensor.H.T @ np.linalg.solve(sensor.R, sensor.H) for sensor in linear_sensors]
-    max_information = max((float(np.abs(G).max()) for G in informations), default=0.0)
+    # Columns of states that a sensor does not read are left out: of many blocks most.
+    read = ((H[:, H.any(axis=0)], s.R) for s in scenario.sensors if s.linear for H in [s.H])
+    informations = (H.T @ np.linalg.solve(R, H) for H, R in read)
+    max_information = max((float(np.abs(G).max(initial=0.0)) for G in informations), default=0.0)
     filter_rate = np.sqrt(max_information * max(float(np.abs(Q).max()) for _, Q in believed))
     true = [piece.A for piece in scenario.diffusion.pieces]
     A = max(true, key=growth_rate)

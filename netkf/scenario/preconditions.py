@@ -8,6 +8,7 @@ here is the only place that checks them, in slots and in continuous time.
 from __future__ import annotations
 
 import itertools
+from bisect import bisect_right
 from typing import Any
 
 import numpy as np
@@ -130,10 +131,13 @@ def _wider_estimates(scenario: DerivedScenario) -> str:
 def _check_rows(scenario: DerivedScenario, k: int, key: str, sensor: Any) -> None:
     """Check that no row of a linear sensor of node number ``k`` reads several unknown blocks."""
     H = getattr(sensor, "H", None)
-    unknown = [place for place in scenario.layout.places if place not in scenario.estimated[k]]
+    places, known = scenario.layout.places, scenario.estimated[k]
+    firsts = [place.first for place in places]
     for row in () if H is None or H.shape[1] != scenario.plant.n else H:
-        read = [f"{place.name} of {place.node}" for place in unknown if row[place.entries].any()]
-        if len(read) > 1:
+        used = dict.fromkeys(bisect_right(firsts, entry) - 1 for entry in np.flatnonzero(row))
+        unknown = [places[number] for number in used if places[number] not in known]
+        if len(unknown) > 1:
+            read = [f"{place.name} of {place.node}" for place in unknown]
             rule = f"must read one block at most that node {scenario.nodes[k]} does not estimate"
             raise ScenarioError(f"{key}.H", rule, read, "split it, or estimate more blocks")
 

@@ -257,3 +257,27 @@ def test_sampled_sensors_have_a_truth_up_to_any_horizon(horizon):
     run = netkf.simulate(scenario)
     assert run.status == "complete"
     assert np.isfinite(run.x).all()
+
+
+def test_blocks_without_effect_on_each_other_are_left_out_to_the_bit(monkeypatch):
+    """Of many blocks a state is moved by those of its own; the path is that of full sums."""
+    blocks, coupling = [A, DEFECTIVE, [[-0.3]], A], np.zeros((7, 7))
+    coupling[6, 1] = 0.4  # a block drives one that is not beside it
+    dynamics = scipy.linalg.block_diag(*blocks) + coupling
+    noise = scipy.linalg.block_diag(B, [[0.0], [1.0]], [[0.5]], B)
+
+    def states():
+        plant = Diffusion(dynamics, noise, mean=np.ones(7), cov=np.eye(7))
+        cells = tree.Tree(plant.moves, 9.0, None)
+        times, stream = (
+            np.array([0.3, 1.0 / 3.0, 0.5, 7.123456789]),
+            Streams(1).states("plant", [()]),
+        )
+        return cells.states(times, np.ones(7), stream, 0)[0], cells._cells
+
+    found, cells = states()
+    assert (np.diff(cells.of_v) < 4).sum() > 0.4 * cells.of_v[..., 0].size
+    monkeypatch.setattr(tree, "_spans", lambda used: np.full((*used.shape[:2], 2), [0, 7]))
+    full, cells = states()
+    assert (np.diff(cells.of_v) == 7).all()
+    assert found.tobytes() == full.tobytes()

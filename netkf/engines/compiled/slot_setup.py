@@ -244,7 +244,9 @@ class SlotSetup:
                         places[h, first : first + rows, : len(place)] = place[:, None]
 
     def _set_kernel_sensors(self, scenario: Scenario) -> None:
-        count, p, n = len(self.kernel_sensors), self.p, self.n
+        count, n = len(self.kernel_sensors), self.n
+        # A filter may stack far more rows than one of its sensors has.
+        p = max((len(s.root) for s in self.kernel_sensors), default=1)
         H, noise = np.zeros((count, p, n)), np.zeros((count, p, p))
         regressor_index = np.full(count, -1, dtype=np.int64)
         for m, s in enumerate(self.kernel_sensors):
