@@ -337,6 +337,31 @@ def test_drawn_scenarios_in_slots_are_recorded_without_a_fault(number, tmp_path)
     assert sample_fault(scenario, run, number, 0) == ""
 
 
+@pytest.mark.parametrize("name", ["recorded pairs", "nodes", "readings", "links", "directions"])
+def test_networks_that_come_and_go_are_recorded_without_a_fault(name, tmp_path):
+    """Pairs from a table, in slots; nodes that move out of range, by each kind of clock."""
+    if name == "recorded pairs":
+        (tmp_path / "pairs.csv").write_text("slot,node,peer\n1,0,1\n2,1,2\n5,0,2\n")
+        network = {"activation": {"kind": "recorded", "path": "pairs.csv"}}
+        table = {**GOSSIP, "network": GOSSIP["network"] | network}
+    else:
+        rows = ["t,node,x,y", *(f"0,{k},{k % 2},{k // 2}" for k in range(4)), "2,3,9,9", "3,3,1,1"]
+        (tmp_path / "places.csv").write_text("\n".join(rows) + "\n")
+        clock = {"kind": "poisson", "rate": 3.0, "at": name}
+        network = {
+            "graph": {"kind": "range", "nodes": 4, "radius": 1.2},
+            "positions": "places.csv",
+            "activation": {"kind": "readings"} if name == "readings" else clock,
+        }
+        sensors = [{**SAMPLED, "sampling": {"kind": "poisson", "rate": 3.0}}]
+        weighted = {"kind": "covariance-intersection", "epsilon": 0.2}
+        table = {**RING, "sensors": sensors, "network": network, "filter": weighted}
+    scenario = with_check_times(from_table(table, tmp_path))
+    run = netkf.simulate(scenario, seed=1)
+    assert run.count("send")
+    assert event_fault(scenario, run) == ""
+
+
 def broken_rows(verdict):
     return [row.promise for row in verdict.rows if row.verdict == BROKEN]
 

@@ -17,7 +17,7 @@ from netkf.algorithms.filter import may_be_silent
 from netkf.checks.parts.events import draw_ticks
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.network.clocks import LinkClock, OnReadings
-from netkf.network.matchings import Matching, RecordedSlots
+from netkf.network.matchings import RecordedSlots
 from netkf.plants.recorded import RecordedSensor
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
@@ -188,11 +188,9 @@ def _decided(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
 
 def _absorbed(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
     kinds = log["kind"]
-    if scenario.slotted and isinstance(scenario.network.activation, Matching):
+    if scenario.slotted and scenario.node_filter.timing.pairwise:
         swaps, arrivals = (np.flatnonzero(kinds == kind) for kind in (SWAP, DELIVER))
         fields = ["node", "peer", "message", "phase"]
-        if not scenario.node_filter.timing.pairwise:
-            return
         one, other = (np.sort(log[rows][fields]) for rows in (swaps, arrivals))
         # Messages of the last exchange may arrive in a slot that is not recorded to its end.
         if not np.array_equal(one, other):
