@@ -77,7 +77,7 @@ class Ages:
     nodes, sources, links : ids in increasing order; directed links (sender, receiver), sorted
     steady    : the sources that read continuously
     forgetful : nodes that know nothing after they were down
-    swaps     : a message replaces what its receiver knew, of several the last of the last sender
+    swaps     : a message replaces what its receiver knew, of several the newest of the last sender
     tells_all : ``tells_all(phase)``, False for messages that tell the sender's own reading only
     read_at   : ``read_at(node, times)``, when the readings used at ``times`` (K,) were taken, nan
                 where there was none; ``node`` (K,) are ids
@@ -232,12 +232,12 @@ def clear(s: AgeState, i: int) -> None:
 
 @kernel
 def use(s: AgeState, i: int, t: float) -> None:
-    """Let node ``i`` use the messages that wait for it: all, or in a swap the last one of the last
-    sender, which replaces all that it knows.
+    """Let node ``i`` use the messages that wait for it: all, or in a swap the newest one of the
+    last sender, which replaces all that it knows.
     """
     k, chosen = s.inbox[i], -1
     while k >= 0:
-        if chosen < 0 or s.sender[k] > s.sender[chosen]:
+        if chosen < 0 or (s.sender[k], s.number[k]) > (s.sender[chosen], s.number[chosen]):
             chosen = k
         k = s.following[k]
     k = s.inbox[i]

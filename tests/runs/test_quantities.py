@@ -123,11 +123,11 @@ def ages_by_hand(scenario, log, sources):
         elif kind in ("lost", "late"):
             flying.pop((i, j, key) if kind == "lost" else (j, i, key))
         elif kind == "deliver":
-            waiting[i].append((j, flying.pop((j, i, key))))
+            waiting[i].append((j, key, flying.pop((j, i, key))))
         elif kind in ("absorb", "swap"):
             if analysis.swaps:
-                waiting[i] = [max(enumerate(waiting[i]), key=lambda one: (one[1][0], one[0]))[1]]
-            for _, told in waiting[i]:
+                waiting[i] = [max(waiting[i], key=lambda one: one[:2])]
+            for *_, told in waiting[i]:
                 for s, time in told.items():
                     known[i][s] = time if analysis.swaps else max(known[i][s], time)
                     history[i, s].append((t, known[i][s]))
@@ -177,6 +177,35 @@ def test_ages_by_hand(case):
                 assert found["worst_age"][k] == pytest.approx(max(worst[node]), rel=1e-12)
     assert found["mean_age"][-1] == pytest.approx(np.nanmean(found["mean_age"][:-1]))
     assert found["worst_age"][-1] == np.nanmax(found["worst_age"][:-1])
+
+
+def test_of_two_messages_of_an_instant_a_swap_takes_the_newest(tmp_path):
+    """The first takes a second and comes with the next one, which takes no time."""
+    (tmp_path / "delays.csv").write_text(
+        "sender,receiver,message,seconds\n0,1,0,1.0\n0,1,1,0.0\n1,0,0,0.0\n1,0,1,0.0\n"
+    )
+    (tmp_path / "samples.csv").write_text("t,node\n0.75,0\n1.75,0\n")
+    (tmp_path / "pair.toml").write_text(
+        """
+format = 1
+name = "pair"
+horizon = 3.0
+probe = 1.0
+plant = { kind = "diffusion", A = [[-1.0]], B = [[1.0]] }
+filter = { kind = "gossip" }
+[[sensors]]
+nodes = [0]
+H = [[1.0]]
+R = [[1.0]]
+sampling = { kind = "recorded", path = "samples.csv" }
+[network]
+graph = { kind = "path", nodes = 2 }
+activation = { kind = "periodic", period = 1.0 }
+channel = { delay = { kind = "recorded", path = "delays.csv" } }
+"""
+    )
+    # It is t until 2 s, when the reading of 1.75 s comes.
+    assert network(netkf.load(tmp_path / "pair.toml"))["mean_age"][1] == (2.0 + 0.75) / 3.0
 
 
 PATH = """
