@@ -453,10 +453,15 @@ def _require_laws(scenario: Scenario) -> None:
     for assumption, evidence in scenario.departures:
         if assumption in (RIGHT_CLOCKS, HEALTHY, ALL_READ):
             raise TheoryError(f"{evidence}, so nothing is promised; {CONSISTENCY}")
+        if scenario.network.lives:
+            raise TheoryError(f"{LIVES}, and {evidence}, so nothing is promised; {CONSISTENCY}")
     if scenario.network.lives and not (
         scenario.is_linear and has_columns(scenario) and scenario.views is None
     ):
-        rule = "promises survive it of filters whose verbs are affine kernels of one linear state"
+        rule = (
+            "what is promised then can be checked where dynamics and readings are linear, all "
+            "nodes estimate the same state, and the kernels of the filter are affine"
+        )
         raise TheoryError(f"{LIVES}: {rule}; {CONSISTENCY}")
     if not nodes_with_law(scenario).any():
         raise TheoryError(

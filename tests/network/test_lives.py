@@ -602,6 +602,12 @@ def test_check_holds_a_run_to_the_promises_that_survive(scenario_of, memory):
     assert ("nodes keep what they know" in rows.index) == (memory == "lost")
 
 
+def test_check_names_what_leaves_nothing_to_check(scenario_of):
+    scenario = scenario_of(CLOCKS, *recorded(), filter_="hybrid")
+    with pytest.raises(netkf.TheoryError, match=r"nodes are down at times .* and a gate"):
+        netkf.check(scenario.replace({"filter.gate": {"probability": 0.9}}), runs=10)
+
+
 def test_theory_says_that_no_bound_is_promised(scenario_of):
     scenario = scenario_of(CLOCKS, *recorded(), filter_="hybrid")
     with pytest.raises(netkf.TheoryError):
