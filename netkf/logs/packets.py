@@ -227,8 +227,9 @@ def unwrap(numbers: np.ndarray, times: FloatArray) -> tuple[np.ndarray, int, int
     how often they wrapped, by which modulus, and how often they restarted.
 
     A number that falls, with successors that stay down, wrapped if the skipped numbers fit the time
-    passed, and else restarted; one that falls alone, in less time, is out of order. Of one stamp
-    those come first that go on from the last.
+    passed, and else restarted; one that falls alone, in less time, is out of order. In a hole whole
+    cycles may pass, unless the very next number follows: then the sender paused. Of one stamp those
+    come first that go on from the last.
     """
     modulus = next((m for m in MODULI if m > numbers.max(initial=0)), 0)
     interval, gaps = _find_interval(numbers, times), np.diff(times)
@@ -239,6 +240,7 @@ def unwrap(numbers: np.ndarray, times: FloatArray) -> tuple[np.ndarray, int, int
     place: list[int] = []
     counters = np.empty(len(numbers), dtype=np.int64)
     offset = wraps = restarts = top = last = 0
+    cycle = modulus if (np.diff(numbers) < -0.5 * modulus).any() else 0
     top_time = 0.0
     for k, time in enumerate(times.tolist()):
         if k == len(place):
@@ -249,12 +251,15 @@ def unwrap(numbers: np.ndarray, times: FloatArray) -> tuple[np.ndarray, int, int
         expected = (time + grain - top_time) / interval if interval and k else 0.0
         skipped = number + modulus - last
         falls = k > 0 and number < last - LATE and np.median(numbers[k : k + 8]) < last - LATE
-        is_due = modulus > 0 and abs(skipped - expected) <= 1.0 + 0.25 * expected
-        falls |= k > 0 and number <= last and is_due
+        turns = _whole_turns(skipped, expected, cycle)
+        is_due = modulus > 0 and (turns or abs(skipped - expected) <= 1.0 + 0.25 * expected)
+        falls |= bool(k > 0 and number <= last and is_due)
         if falls and modulus and skipped <= 2.0 * expected + 3.0:
-            offset, wraps = offset + modulus, wraps + 1
+            offset, wraps = offset + (1 + turns) * modulus, wraps + 1 + turns
         elif falls or (k and MAX_SKIP < number - last > 10.0 * expected and not wraps):
             offset, restarts = top + 1 - number, restarts + 1
+        elif k and number > last + 1 and (turns := _whole_turns(number - last, expected, cycle)):
+            offset, wraps = offset + turns * modulus, wraps + turns
         # One of before the wrap may come late, but not after as much time as it is ahead.
         is_late = wraps and not falls and number - last > max(0.5 * modulus, 2.0 * expected)
         counter = number + offset - (modulus if is_late else 0)
@@ -262,6 +267,13 @@ def unwrap(numbers: np.ndarray, times: FloatArray) -> tuple[np.ndarray, int, int
         if not k or counter > top:
             top, top_time, last = counter, time, number
     return counters, wraps, modulus, restarts
+
+
+def _whole_turns(step: int, expected: float, cycle: int) -> int:
+    """Return how many ``cycle`` beside ``step`` packets fit a time of ``expected`` ones well."""
+    turns = round((expected - step) / cycle) if cycle else 0
+    off = abs(step + turns * cycle - expected)
+    return max(turns, 0) if off <= min(1.0 + 0.05 * expected, 0.25 * cycle) else 0
 
 
 def _begin_at(numbers: np.ndarray, first: int | None, modulus: int) -> np.ndarray:

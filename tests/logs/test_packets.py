@@ -229,6 +229,22 @@ def test_after_a_hole_of_half_a_cycle_packets_are_not_late_ones_of_before(modulu
     assert (np.diff(counters) == np.diff(true)).all()
 
 
+@pytest.mark.parametrize("modulus", [16, 256])
+@pytest.mark.parametrize("share", [1.3, 1.6, 2.2, 3.9])
+@pytest.mark.parametrize("begin", [0.3, 2.05])
+def test_whole_cycles_that_nobody_heard_are_counted_by_time(modulus, share, begin):
+    true = np.arange(8 * modulus)
+    true = true[(true < begin * modulus) | (true > (begin + share) * modulus)]
+    times = true + np.random.default_rng(modulus).uniform(0.0, 0.4, len(true))
+    counters, _, _, restarts = unwrap(true % modulus, times)
+    assert restarts == 0
+    assert (np.diff(counters) == np.diff(true)).all()
+    # A sender that pauses goes on with the very next number, however long it was silent.
+    paused = np.arange(8 * modulus)
+    times = paused + np.where(paused >= begin * modulus, share * modulus, 0.0)
+    assert (np.diff(unwrap(paused % modulus, times)[0]) == 1).all()
+
+
 @pytest.mark.parametrize("logged", [True, False])
 @pytest.mark.parametrize(
     ("modulus", "interval", "stamp", "lead"),
