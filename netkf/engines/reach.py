@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
+from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Link
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN
@@ -27,13 +29,23 @@ class Reach:
         self.slot: int | None = 0 if scenario.slotted else None
         # Links that are up, as far as anyone has looked.
         self._up: set[Link] = set()
+        # The present, and where the nodes are that have been asked for: most in many pairs.
+        self._present: tuple[float, int | None] | None = None
+        self._x: FloatArray | None = None
+        self._points: dict[int, tuple[float, ...]] = {}
 
     def distance(self, i: int, j: int, now: float) -> float:
         """Return the distance of two nodes now."""
-        x = None
-        if self._positions.of_state:
-            x = self._truth.absolute(now if self.slot is None else self.slot)
-        return self._positions.distance((i, j), now, x)
+        if self._present != (now, self.slot):
+            self._present = now, self.slot
+            self._points.clear()
+            if self._positions.of_state:
+                self._x = self._truth.absolute(now if self.slot is None else self.slot)
+        points = self._points
+        for node in (i, j):
+            if node not in points:
+                points[node] = self._positions.at(node, now, self._x)
+        return math.dist(points[i], points[j])
 
     def is_up(self, i: int, j: int, now: float) -> bool:
         """Return True if the link of two nodes is up."""

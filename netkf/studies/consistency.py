@@ -163,6 +163,12 @@ def _mean(values: FloatArray, blurred: np.ndarray) -> FloatArray:
         )
 
 
+def _mean_known(values: Sequence[float]) -> float:
+    """Return the mean over the runs that know a value: in some a node may have no reading."""
+    known = [value for value in values if not math.isnan(value)]
+    return float(np.mean(known)) if known else math.nan
+
+
 def _count_errors(scenario: Scenario) -> int:
     return len(scenario.nodes) * scenario.width
 
@@ -476,8 +482,8 @@ def _judge_block(
         width=width,
         expected=float(expected.mean()),
         inside=share_inside,
-        nis=float(np.mean([run.nis[i] for run in runs])),
-        expected_nis=float(np.mean([run.expected_nis[i] for run in runs])),
+        nis=_mean_known([run.nis[i] for run in runs]),
+        expected_nis=_mean_known([run.expected_nis[i] for run in runs]),
         verdict=verdict,
         block=block.block,
         n=n,

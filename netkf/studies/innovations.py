@@ -15,8 +15,10 @@ from netkf.scenario.scenario import Scenario
 from netkf.trace.nees import BLUR, ROUNDING
 from netkf.trace.run import Run
 
-MAX_INSTANTS = 60
-"""Instants of samples of a run, evenly spread, whose innovations are judged."""
+MAX_INSTANTS = 40
+"""Instants of samples of each node in a run, evenly spread, whose innovations are judged."""
+MAX_ENTRIES = 25_000_000
+"""Entries of covariances at these and at the events before: large networks have fewer instants."""
 
 
 class JudgedBlock(NamedTuple):
@@ -84,8 +86,8 @@ class ClockedInnovations:
     ``run`` is the same one, with samples at ``times``; ``sigma`` (T, N, n, n) is E[e e'] there,
     None if it is unknown.
 
-    times : the samples of ``scenario``, instants of its sensors, and for each node the last event
-            before each of these
+    times : the samples of ``scenario``, and for each node instants of its sensors and its last
+            events before these
     """
 
     run: Run
@@ -95,17 +97,23 @@ class ClockedInnovations:
         plant: Any = scenario.plant
         self._scenario, self._streams = scenario, streams
         self._moves, self._sampled = Transitions(plant.A, plant.B), sample_times(scenario, streams)
-        every = np.unique(np.concatenate([*self._sampled.values()]))
-        every = every[(every > 0.0) & (every < scenario.horizon)]
-        chosen = np.linspace(0, len(every) - 1, MAX_INSTANTS if len(every) else 0)
-        self._chosen = every[np.unique(chosen.astype(int))]
-        pooled, parts = scenario.node_filter.timing.pooled, [scenario.times, self._chosen]
-        for node in scenario.nodes:
+        samples = dict[int, list[FloatArray]]()
+        for (node, _), times in self._sampled.items():
+            samples.setdefault(node, []).append(times)
+        pooled, entries = scenario.node_filter.timing.pooled, len(scenario.nodes) * plant.n**2
+        count = min(MAX_INSTANTS, MAX_ENTRIES // (2 * max(1, len(samples)) * entries))
+        # By node the chosen instants, and the last events before them.
+        self._chosen, self._before = dict[int, FloatArray](), dict[int, FloatArray]()
+        for node, times in samples.items():
+            every = np.unique(np.concatenate(times))
+            every = every[(every > 0.0) & (every < scenario.horizon)]
+            chosen = np.linspace(0, len(every) - 1, count if len(every) else 0)
+            self._chosen[node] = every[np.unique(chosen.astype(int))]
             is_own = pooled | (log["node"] == node) | (log["peer"] == node)
             events = np.unique(np.append(log["t"][is_own], 0.0))
-            parts.append(events[np.searchsorted(events, self._chosen) - 1])
-        self._before = parts[2:]
-        self.times = np.unique(np.concatenate(parts))
+            self._before[node] = events[np.searchsorted(events, self._chosen[node]) - 1]
+        parts = [*self._chosen.values(), *self._before.values()]
+        self.times = np.unique(np.concatenate([scenario.times, *parts]))
 
     def of_block(self, block: JudgedBlock, blurred: np.ndarray) -> Iterator[tuple[float, float]]:
         """Yield NIS of a block and its expected value, without ``blurred`` predictions (T,)."""
@@ -113,7 +121,9 @@ class ClockedInnovations:
         x, view, own = run.x, scenario.view(i), scenario.is_estimated[i]
         if scenario.knows_input:
             x = x - scenario.believed_response.states(run.times)
-        for time, start in zip(self._chosen.tolist(), self._before[i].tolist(), strict=True):
+        node, none = scenario.nodes[i], np.empty(0)
+        pairs = [of_nodes.get(node, none).tolist() for of_nodes in (self._chosen, self._before)]
+        for time, start in zip(*pairs, strict=True):
             now, last = np.searchsorted(run.times, [time, start]).tolist()
             if time not in readings or now >= len(run.times) or blurred[last]:
                 continue

@@ -61,10 +61,11 @@ def size(
     exact value where it is known; else the bound where that reaches the target, and simulation
     where it does not. By simulation, runs are added at each value until an interval decides, at
     most ``runs`` (None: 1,000, for small networks in the compiled engine 10,000); all values share
-    the same random draws, and all decisions together are right with probability ``confidence``. In
-    SimPy, where runs are costly, the exact covariance of the errors given the events of a run
-    replaces the squared errors if it is known and the network small, which takes far fewer runs.
-    The quantity is assumed to be monotone in the key; that is checked at the values that are tried.
+    the same random draws, and all decisions together are right with probability ``confidence``.
+    Where runs are costly (SimPy) or few (below 1,000), the exact covariance of the errors given the
+    events of a run replaces the squared errors if it is known and the network small: it takes as
+    long as hundreds of compiled runs, and is worth dozens. The quantity is assumed to be monotone
+    in the key; that is checked at the values that are tried.
 
     ``seed``, ``workers``, ``executor``, ``scheduler`` and ``engine`` are those of
     ``netkf.monte_carlo``; ``progress`` is called with a line of text as simulations go on. Raises
@@ -76,16 +77,15 @@ def size(
         one_of("theory", "simulation")("--by", by)
     parsed = parse_target(target)
     confidence = number(above=0.0, below=1.0)("--confidence", confidence)
+    given = None if runs is None else require_runs(runs, FIRST_BATCH, "--runs")
     if parsed.of_errors and not scenario.plant.truth_known:
         rule = "is about errors, and there is no ground truth"
         raise ScenarioError("--target", rule, target, "ask for mean_trace or worst_trace")
     base = parsed.prepare(scenario if seed is None else scenario.replace({"seed": seed}))
     is_integer = _check_range(base, key, low, high)
     engine_used = choose_engine(engine, base.replace({key: low}))
-    cheap = engine_used.name == "compiled" and is_small(base)
-    most = require_runs(
-        (CHEAP_RUNS if cheap else RUNS) if runs is None else runs, FIRST_BATCH, "--runs"
-    )
+    cheap = engine_used.name == "compiled" and is_small(base) and (given or RUNS) >= RUNS
+    most = given or (CHEAP_RUNS if cheap else RUNS)
     chosen = by or _choose_method(base, key, (low, high), parsed)
     search = Search(base, key, is_integer, parsed, chosen)
     if chosen == "theory":

@@ -14,6 +14,7 @@ from netkf.core.errors import ScenarioError
 from netkf.rng.streams import Streams
 from netkf.runs.labels import covariance_bias, mismatch_note
 from netkf.scenario.reading import from_table
+from netkf.studies import innovations
 from netkf.studies.consistency import (
     RunConsistency,
     consistency,
@@ -21,6 +22,7 @@ from netkf.studies.consistency import (
     judged_blocks,
     run_consistency,
 )
+from netkf.studies.innovations import ClockedInnovations
 from netkf.studies.metrics import expected_metrics
 from netkf.studies.tables import format_consistency
 from tests.algorithms.test_block_intersection import CLOCKED, ROBOTS, load
@@ -319,3 +321,34 @@ def test_nis_under_clocks_is_that_of_samples(tmp_path):
     found = run_consistency(own, 3, 2)
     assert np.isfinite(found.nis[blocks[2, "pose@3"]])
     assert found.expected_nis[blocks[2, "pose@3"]] <= 1.0 + 1e-9
+
+
+def test_nodes_that_sample_at_times_of_their_own_have_innovations_each(ring, monkeypatch):
+    """As many as nodes that sample together, and fewer where the network is large: that of 1000
+    nodes was refused, as if its user had asked for too many probe times.
+    """
+    sampling = {"kind": "poisson", "rate": 1.0}
+    sensors = [{"nodes": list(range(6)), "H": [[1.0, 0.0]], "R": [[0.2]], "sampling": sampling}]
+    scenario = ring.replace({"sensors": sensors, "horizon": 8.0})
+    run = netkf.simulate(scenario, seed=3)
+    for most, count in ((innovations.MAX_ENTRIES, 8.0), (6 * 6 * 4 * 2 * 3, 3.0), (1, 0.0)):
+        monkeypatch.setattr(innovations, "MAX_ENTRIES", most)
+        found = ClockedInnovations(scenario, run.log, Streams(3, 0))
+        found.run, found.sigma = netkf.simulate(scenario.replace({"probe": found.times}), 3), None
+        numbers = [
+            len(list(found.of_block(block, np.zeros(len(found.times), dtype=bool))))
+            for block in judged_blocks(scenario)
+        ]
+        assert np.mean(numbers) == pytest.approx(count, rel=0.35)
+        assert np.isfinite(run_consistency(scenario, 3, 0).nis).all() == (count > 0.0)
+
+
+def test_runs_in_which_a_node_reads_nothing_do_not_hide_its_innovations(ring):
+    sampling = {"kind": "poisson", "rate": 0.4}
+    sensors = [{"nodes": [0, 1, 2], "H": [[1.0, 0.0]], "R": [[0.2]], "sampling": sampling}]
+    scenario = ring.replace({"sensors": sensors, "filter": {"kind": "local"}, "horizon": 5.0})
+    runs = [run_consistency(scenario, 1, replica) for replica in range(20)]
+    assert np.isnan([run.nis[:3] for run in runs]).any()
+    found = judge_consistency(scenario, runs, 0.99)
+    assert np.isfinite(found.table["nis"][:3]).all()
+    assert np.isnan(found.table["nis"][3:]).all()
