@@ -104,8 +104,8 @@ class ClockedInnovations:
         count = min(MAX_INSTANTS, MAX_ENTRIES // (2 * max(1, len(samples)) * entries))
         # By node the chosen instants, and the last events before them.
         self._chosen, self._before = dict[int, FloatArray](), dict[int, FloatArray]()
-        for node, times in samples.items():
-            every = np.unique(np.concatenate(times))
+        for node, of_sensors in samples.items():
+            every = np.unique(np.concatenate(of_sensors))
             every = every[(every > 0.0) & (every < scenario.horizon)]
             chosen = np.linspace(0, len(every) - 1, count if len(every) else 0)
             self._chosen[node] = every[np.unique(chosen.astype(int))]
