@@ -9,6 +9,7 @@ import scipy
 
 from netkf.core.fields import Component, field, number, one_of
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.portable import cholesky, solve_lower
 
 NEVER = 1e300
 """A factor on R beyond all use."""
@@ -45,17 +46,24 @@ class Gate(Component):
         tails = (float(scipy.stats.chi2.sf(limit, p + k)) for k in (2, 0))
         return next(tails) / next(tails)
 
-    def factor(self, z: FloatArray, expected: FloatArray, R: FloatArray) -> float:
-        """Return by what R (p, p) of the innovation z (p,) is multiplied, ``expected`` (p, p) being
-        H P H': 1 for a reading that is taken, inf for one that is ignored.
+    def factor(self, z: FloatArray, spread: FloatArray, R: FloatArray) -> float:
+        """Return by what R (p, p) of the innovation z (p,) is multiplied, ``spread`` (p, n) being H
+        times a root of P: 1 for a reading that is taken, inf for one that is ignored.
         """
-        limit = self.limit(len(z))
+        root = cholesky(R)
+        w, G = solve_lower(root, z[:, None])[:, 0], solve_lower(root, spread)
+        # Of a filter that has diverged.
+        if not len(z) or not np.isfinite(w).all() or not np.isfinite(G).all():
+            return 1.0
+        # S is singular to rounding where P is very much larger than R: its root is not.
+        U, s, _ = np.linalg.svd(G)
+        squares, variances, limit = (U.T @ w) ** 2, np.zeros(len(z)), self.limit(len(z))
+        variances[: len(s)] = s**2
 
         def excess(factor: float) -> float:
-            S = expected + factor * R
-            return float(z @ scipy.linalg.solve(S, z, assume_a="pos")) - limit
+            return float((squares / (variances + factor)).sum()) - limit
 
-        if not len(z) or excess(1.0) <= 0.0:
+        if excess(1.0) <= 0.0:
             return 1.0
         if self.then == "ignore":
             return np.inf

@@ -38,7 +38,7 @@ class Quantisation(Component):
     @property
     def variance(self) -> float:
         """The variance ``step^2 / 12`` of the error of a number."""
-        return self.step**2 / 12.0
+        return self.step * self.step / 12.0
 
     @property
     def levels(self) -> float:

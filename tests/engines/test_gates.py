@@ -403,3 +403,17 @@ def test_each_row_of_a_table_passes_by_itself_in_slots(tmp_path, engine, sensor,
     np.testing.assert_allclose(together.P, apart.P, rtol=1e-9, atol=1e-12)
     assert together.fingerprint == apart.fingerprint
     assert 5 < together.count("refuse") < 30
+
+
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_two_readings_of_a_state_that_is_all_but_unknown(scenario_of, tmp_path, engine):
+    """P is 1e20 times R, so that S is singular to rounding: the readings must fit each other."""
+    text = SLOTS.replace("[[0.2, 0.0], [0.0, 0.3]]", "[[1e20, 0.0], [0.0, 1e20]]")
+    one = '[[sensors]]\nkind = "recorded"\nnodes = [1]\npath = "both.csv"\n'
+    one += "H = [[1.0, 0.0], [2.0, 0.0]]\nR = [[1.0, 0.0], [0.0, 1.0]]\n"
+    text = text.split("[[sensors]]", maxsplit=1)[0] + one + "[network]" + text.split("[network]")[1]
+    # The rest of (y, 2 y + d) is d^2 / 5: beyond the quantile 4.61 of .9 for d = 7, not for d = 4.
+    rows = ["t,node,y0,y1", "1,1,1e9,2000000004", "2,1,-3e9,-5999999993", "3,1,5e8,1e9"]
+    (tmp_path / "both.csv").write_text("\n".join(rows) + "\n")
+    run = netkf.simulate(scenario_of(text, "probability = 0.9", 5.0), engine=engine)
+    assert run.log["t"][run.log["kind"] == CODES["refuse"]].tolist() == [2.0]

@@ -15,10 +15,10 @@ import numpy as np
 
 from netkf.algorithms.gates import Gate
 from netkf.algorithms.kernels.run import Estimates
+from netkf.algorithms.kernels.square_root import reflect
 from netkf.linalg.addresses import reads_only
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.small import solve_inplace
 from netkf.linalg.structs import Struct
 
 MOST_STEPS, CLOSE = 100, 1e-15
@@ -35,7 +35,7 @@ class GateTables(Struct):
     first : (K + 1,), the parts of list k are ``first[k]`` to ``first[k + 1]`` - 1
     row, length : (G,), first row and number of rows of each part
     scale : (G, L), by which its rows were multiplied
-    G, z, S, out : scratch (P, n), (P,), (P, P) and (P, 1)
+    G, z, L, out : scratch (P, n), (P,), (P, P + n) and (P,)
     """
 
     limits: FloatArray
@@ -48,7 +48,7 @@ class GateTables(Struct):
     scale: FloatArray
     G: FloatArray
     z: FloatArray
-    S: FloatArray
+    L: FloatArray
     out: FloatArray
 
 
@@ -76,8 +76,8 @@ def gate_tables(
         scale=np.ones((len(every), runs[0])),
         G=np.zeros((most, n)),
         z=np.zeros(most),
-        S=np.zeros((most, most)),
-        out=np.zeros((most, 1)),
+        L=np.zeros((most, most + n)),
+        out=np.zeros(most),
     )
 
 
@@ -160,15 +160,25 @@ def _scale_of_part(record: Any, h: int, g: int, q: int, run: Any) -> float:
 @kernel
 def _distance(gate: GateTables, p: int, n: int, factor: float) -> tuple[float, float]:
     """Return z' S^-1 z with S = G G' + factor 1, and minus its derivative by the factor."""
+    L, out = gate.L, gate.out
+    # S = L L' may be singular to rounding where P is very much larger than R, L is not.
     for i in range(p):
+        out[i] = gate.z[i]
         for k in range(p):
-            gate.S[i, k] = factor if i == k else 0.0
-            for j in range(n):
-                gate.S[i, k] += gate.G[i, j] * gate.G[k, j]
-        gate.out[i, 0] = gate.z[i]
-    solve_inplace(gate.S, gate.out, p)
+            L[i, k] = math.sqrt(factor) if i == k else 0.0
+        for j in range(n):
+            L[i, p + j] = gate.G[i, j]
+    for i in range(p):
+        reflect(L, i, p, p + n)
     distance = slope = 0.0
     for i in range(p):
-        distance += gate.z[i] * gate.out[i, 0]
-        slope += gate.out[i, 0] * gate.out[i, 0]
+        for k in range(i):
+            out[i] -= L[i, k] * out[k]
+        out[i] /= L[i, i]
+        distance += out[i] * out[i]
+    for i in range(p - 1, -1, -1):
+        for k in range(i + 1, p):
+            out[i] -= L[k, i] * out[k]
+        out[i] /= L[i, i]
+        slope += out[i] * out[i]
     return distance, slope

@@ -355,7 +355,8 @@ class Node:
         present = np.isfinite(y) if len(y) == len(H) else np.zeros(len(H), dtype=bool)
         z, J, C = (y - H @ xhat)[present], H[present], R[np.ix_(present, present)]
         assert self._gate is not None
-        factor = self._gate.factor(z, J @ P @ J.T, C)
+        assert P is not None
+        factor = self._gate.factor(z, J @ first_root(P), C)
         if factor != 1.0:
             recorder.append((time, REFUSE, self.node, peer, -1, -1, NAN))
         return factor
