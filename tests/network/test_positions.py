@@ -350,6 +350,14 @@ def test_messages_in_range_are_no_fault_of_the_record(tmp_path, clock):
     assert event_fault(moving, run) == ""
 
 
+def test_bits_that_nobody_in_range_hears_are_no_fault_of_the_filter(tmp_path):
+    """Their sender uses them, and the log has no messages of it."""
+    moving = scenario(
+        tmp_path, "broadcast", {"kind": "none"}, RANGE, MOVING, filter={"kind": "one-bit"}
+    )
+    assert netkf.check(moving, runs=10, workers=1)
+
+
 @pytest.mark.parametrize("clock", ["nodes", "broadcast", "matching"])
 @pytest.mark.parametrize("kind", ["drawn", "recorded", "unknown"])
 def test_a_target_beside_robots_that_links_follow(tmp_path, clock, kind):

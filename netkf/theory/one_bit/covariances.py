@@ -33,10 +33,12 @@ def one_bit_update(P: ArrayLike, H: ArrayLike, R: ArrayLike) -> FloatArray:
 
 
 def bit_covariances(scenario: Scenario, run: Run) -> FloatArray:
-    """Return P (T, N, n, n) of a run by the bits that arrived; TheoryError if H varies."""
+    """Return P (T, N, n, n) of a run by the bits that arrived; TheoryError if not all are known."""
     unheard = [node for node in scenario.sensing_nodes if not scenario.topology.receivers(node)]
     if unheard:
         raise TheoryError(f"nobody hears node {unheard[0]}: the log does not show its bits")
+    if scenario.topology.radius is not None:
+        raise TheoryError("the log does not show the bits of a node with nobody in range")
     nodes, index, plant = scenario.nodes, scenario.topology.index, scenario.slot_plant
     F, Q = scenario.slot_belief
     sensors = [scenario.observation_matrices(node, believed=True) for node in nodes]
