@@ -553,10 +553,8 @@ def _delay_table(scenario: Scenario, table: pd.DataFrame, notes: list[str]) -> d
     delay = scenario.network.channel.delay
     if not isinstance(delay, RecordedDelay):
         return {}
-    listed = [
-        v for link in delay.table.values.values() for v in link.values() if v < scenario.horizon
-    ]
-    seconds = np.array([v for v in listed if v > 0.0])
+    listed = delay.rows[delay.rows < scenario.horizon]
+    seconds = listed[listed > 0.0]
     if not len(seconds):
         return {"kind": "none"}
     heard = table[table["delivered"] == 1].get("delay", pd.Series(dtype=float))

@@ -6,7 +6,7 @@ import math
 from abc import abstractmethod
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from netkf.core.fields import (
 from netkf.core.laws import WaitingLaw, exponential_law, lognormal_law, uniform_law
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Topology
-from netkf.network.losses import Transmission
+from netkf.network.losses import Transmission, is_vectorised
 
 _SECONDS = number(low=0.0)
 
@@ -47,9 +47,13 @@ class Delay(Component):
             "fixed": either(_SECONDS, _NONE, lambda value: value is None),
             "longest": either(_SECONDS, _FOREVER, _is_infinite),
             "is_random": boolean,
+            "vectorised": boolean,
             "law": stated(WaitingLaw, optional=True),
         }
     )
+
+    vectorised: ClassVar[bool] = False
+    """True if ``message_delay`` takes many messages of a link at once."""
 
     @abstractmethod
     def draw(self, random: np.random.Generator) -> float:
@@ -77,11 +81,12 @@ class Delay(Component):
         """
         return None
 
-    def message_delay(self, sent: Transmission, drawn: float) -> float:
+    def message_delay(self, sent: Transmission, drawn: Any) -> Any:
         """Return the seconds that the message ``sent`` takes.
 
         The result is not negative, and nan if the message is lost. ``drawn`` is the result of
-        ``draw`` if delays are random, else ``fixed`` or 0.
+        ``draw`` if delays are random, else ``fixed`` or 0. Where the class is ``vectorised``
+        ``sent`` may be many messages of a link, and the result an array.
         """
         return drawn
 
@@ -198,6 +203,22 @@ def draw_delay(delay: Delay, random: np.random.Generator) -> float:
 def delay_depends_on_message(delay: Delay) -> bool:
     """Return True if the class overrides ``message_delay``."""
     return type(delay).message_delay is not Delay.message_delay
+
+
+def checked_delays(delay: Delay, sent: Transmission, drawn: FloatArray) -> FloatArray:
+    """Return the seconds (K,) that K messages ``sent`` on a link take; see ``checked_delay``."""
+    if is_vectorised(delay, "message_delay"):
+        seconds = np.asarray(delay.message_delay(sent, drawn), dtype=np.float64)
+        if seconds.shape == drawn.shape and not (seconds < 0.0).any():
+            return seconds
+    columns = (sent.number, sent.time, sent.bad, np.broadcast_to(sent.distance, drawn.shape))
+    rows = zip(*(np.asarray(c).tolist() for c in (*columns, drawn)), strict=True)
+    return np.array(
+        [
+            checked_delay(delay, sent._replace(number=k, time=t, bad=bad, distance=d), one)
+            for k, t, bad, d, one in rows
+        ]
+    )
 
 
 def checked_delay(delay: Delay, sent: Transmission, drawn: float) -> float:

@@ -564,14 +564,14 @@ def has_conditions(loss: Loss) -> bool:
     return type(loss).conditions is not Loss.conditions
 
 
-def _is_vectorised(loss: Loss) -> bool:
-    """Return True if the class that defines the probability says that it takes many messages."""
-    ancestors = type(loss).__mro__
+def is_vectorised(part: Any, method: str) -> bool:
+    """Return True if the class that defines a ``method`` says that it takes many messages."""
+    ancestors = type(part).__mro__
     says, defines = (
         next(k for k, cls in enumerate(ancestors) if name in vars(cls))
-        for name in ("vectorised", "delivery_probability")
+        for name in ("vectorised", method)
     )
-    return bool(loss.vectorised) and says <= defines
+    return bool(part.vectorised) and says <= defines
 
 
 def next_state(loss: Loss, link: Link, before: bool | None, random: np.random.Generator) -> bool:
@@ -594,7 +594,7 @@ def stated_delivery(loss: Loss, sent: Transmission) -> float:
 
 def delivery_probabilities(loss: Loss, sent: Transmission) -> FloatArray:
     """Return checked probabilities (K,) of messages ``sent`` on a link; raises ScenarioError."""
-    if _is_vectorised(loss):
+    if is_vectorised(loss, "delivery_probability"):
         values = demand_probability(loss, sent, loss.delivery_probability(sent))
         return np.broadcast_to(values, np.shape(sent.number))
     columns = np.broadcast_arrays(sent.number, sent.time, sent.bad, sent.distance)[1:]

@@ -14,7 +14,7 @@ from netkf.core.csv_files import Columns, read_columns
 from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.fields import Component, SourceFile, field, one_of, source_file
 from netkf.core.repeated_rows import RowUse, count_rows, first_rows
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.network.delays import Delay
 from netkf.network.graphs import Link, Topology, demand_links
 from netkf.network.losses import Loss, Transmission
@@ -29,17 +29,21 @@ COUNTER_REMEDY = (
 )
 
 
+_NOTHING = np.array([-1]), np.array([np.nan])
+"""Numbers and values of a link of which nothing is listed."""
+
+
 @dataclass(frozen=True)
 class MessageTable:
-    """A value for each listed message of each directed link: ``values[link][number]``, with
-    messages of a link (sender, receiver) numbered from 0.
+    """A value for each listed message of each directed link (sender, receiver): ``values[link]``
+    are the numbers (K,) of its messages, counted from 0, in order, and the values (K,) of these.
 
     ``row_keys`` has the (sender, receiver, number) of each row of ``columns``: rows may repeat a
     message and its value.
     """
 
     columns: Columns
-    values: Mapping[Link, Mapping[int, float]]
+    values: Mapping[Link, tuple[IntArray, FloatArray]]
     row_keys: Sequence[tuple[int, int, int]]
 
     @property
@@ -47,27 +51,25 @@ class MessageTable:
         """The file of the table."""
         return self.columns.source
 
-    @cached_property
-    def _lengths(self) -> dict[Link, int]:
-        return {link: 1 + max(listed) for link, listed in self.values.items()}
-
-    def value(self, link: Link, message: int, after: str) -> float | None:
-        """Return the value of a message on ``link``, None if it is not listed: with ``after``
-        "repeat" the table starts again, with "refuse" ScenarioError is raised at "path".
+    def value(self, link: Link, message: Any, after: str) -> Any:
+        """Return the value of a message on ``link``, or of messages (K,), nan if it is not listed:
+        with ``after`` "repeat" the table starts again, with "refuse" ScenarioError is raised at
+        "path".
         """
-        listed = self.values.get(link, {})
-        if after == "repeat" and listed:
-            message %= self._lengths[link]
-        value = listed.get(message)
-        if value is None and after == "refuse":
+        numbers, values = self.values.get(link, _NOTHING)
+        if after == "repeat" and link in self.values:
+            message = message % (numbers[-1] + 1)
+        place = np.minimum(np.searchsorted(numbers, message), len(numbers) - 1)
+        listed = numbers[place] == message
+        if after == "refuse" and not np.all(listed):
             raise ScenarioError(
                 "path",
                 f"{self.source.name} must list every message that is sent, "
                 'because after = "refuse"',
-                f"message {message} from node {link[0]} to node {link[1]}",
+                f"message {np.extract(~listed, message)[0]} from node {link[0]} to node {link[1]}",
                 "add the row, shorten the horizon or change after",
             )
-        return value
+        return np.where(listed, values[place], np.nan)[()]
 
     def use(self, sent: Mapping[Link, int]) -> tuple[RowUse, int]:
         """Return the use of rows by ``sent`` messages, and how many are not listed."""
@@ -91,9 +93,12 @@ def read_messages(
             printed = [*keys[row], int(entry) if entry.is_integer() else entry]
             raise ScenarioError("path", f"{table.where(row)}: {rule}", printed, "correct the row")
     first = first_rows(table, keys, entries, rule, COUNTER_REMEDY)
-    values: dict[Link, dict[int, float]] = {}
-    for (sender, receiver, message), row in first.items():
-        values.setdefault((sender, receiver), {})[message] = entries[row]
+    listed, rows = np.array([*first], dtype=np.int64).reshape(-1, 3), [*first.values()]
+    order = np.lexsort(listed.T[::-1])
+    listed, given = listed[order], table[column][rows][order]
+    begins = 1 + np.flatnonzero(np.diff(listed[:, :2], axis=0).any(axis=1))
+    parts = zip(np.split(listed, begins), np.split(given, begins), strict=True)
+    values = {(int(k[0, 0]), int(k[0, 1])): (k[:, 2], part) for k, part in parts if len(k)}
     return MessageTable(table, values, keys)
 
 
@@ -125,18 +130,18 @@ class RecordedLoss(_Recorded, Loss):
 
     deterministic = True
 
+    vectorised = True
+
     @cached_property
     def table(self) -> MessageTable:
         """The table, with 1 for each message that is delivered and 0 for the others."""
         rule = "delivered must be 0 or 1, one value a message"
         return read_messages(self.path, "delivered", rule, lambda value: value in (0.0, 1.0))
 
-    def delivery_probability(self, sent: Transmission) -> float:
-        """Return 1 if the table says that the message ``sent`` arrives."""
+    def delivery_probability(self, sent: Transmission) -> Any:
+        """Return 1 where the table says that the message ``sent`` arrives, or each of K (K,)."""
         value = _value_at("network.channel.loss", self.table, sent, self.after)
-        if value is None:
-            return 0.0 if self.after == "lose" else 1.0
-        return value
+        return np.where(np.isnan(value), 0.0 if self.after == "lose" else 1.0, value)[()]
 
     def mean_delivery(self, sent: Transmission) -> float:
         """Return nan: the fraction is unknown before a run."""
@@ -153,6 +158,8 @@ class RecordedDelay(_Recorded, Delay):
 
     is_random = False
 
+    vectorised = True
+
     @cached_property
     def table(self) -> MessageTable:
         """The table of the seconds of each message."""
@@ -166,22 +173,22 @@ class RecordedDelay(_Recorded, Delay):
     @property
     def rows(self) -> FloatArray:
         """The delays (K,) of all listed messages in seconds."""
-        return np.array([value for link in self.table.values.values() for value in link.values()])
+        return np.concatenate(
+            [np.empty(0), *(seconds for _, seconds in self.table.values.values())]
+        )
 
     @property
     def longest(self) -> float:
         """The largest recorded delay in seconds."""
         return float(np.max(self.rows, initial=0.0))
 
-    def message_delay(self, sent: Transmission, drawn: float) -> float:
-        """Return the recorded seconds that the message ``sent`` takes."""
+    def message_delay(self, sent: Transmission, drawn: Any) -> Any:
+        """Return the recorded seconds that the message ``sent`` takes, or each of K (K,)."""
         value = _value_at("network.channel.delay", self.table, sent, self.after)
-        if value is None:
-            return math.nan if self.after == "lose" else 0.0
-        return value
+        return np.where(np.isnan(value) & (self.after != "lose"), 0.0, value)[()]
 
 
-def _value_at(key: str, table: MessageTable, sent: Transmission, after: str) -> float | None:
+def _value_at(key: str, table: MessageTable, sent: Transmission, after: str) -> Any:
     # Asked for during a run, so the error must carry the whole path of its key.
     with errors_under(key):
         return table.value(sent.link, sent.number, after)

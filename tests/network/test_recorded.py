@@ -2,13 +2,20 @@
 
 import math
 
+import numpy as np
 import pytest
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import SourceFile
 from netkf.network.channels import Channel, ChannelDraw, ChannelSampler, transit_time
-from netkf.network.delays import ExponentialDelay, NoDelay, UniformDelay, delay_depends_on_message
-from netkf.network.losses import Transmission
+from netkf.network.delays import (
+    ExponentialDelay,
+    NoDelay,
+    UniformDelay,
+    checked_delays,
+    delay_depends_on_message,
+)
+from netkf.network.losses import Transmission, delivery_probabilities
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 
 WAY, BACK = (0, 1), (1, 0)
@@ -108,3 +115,22 @@ def test_negative_delays_are_refused(record):
 
     with pytest.raises(ScenarioError, match=r"Early: the delay of message 3 .* not be negative"):
         transit_time(Channel(delay=Early()), Transmission(WAY, 3), FINE)
+
+
+@pytest.mark.parametrize("after", ["deliver", "lose", "repeat"])
+def test_many_messages_of_a_link_have_the_fates_of_each(record, after):
+    """Also of a class that is derived and takes them one by one."""
+
+    class Slower(RecordedDelay):
+        def message_delay(self, sent, drawn):
+            return 2.0 * super().message_delay(sent, drawn) if sent.number < 3 else drawn
+
+    loss = record(RecordedLoss, ["0,1,2,0", "0,1,0,1"], after=after)
+    delays = [record(cls, ["0,1,3,.5", "0,1,1,.2"], after=after) for cls in (RecordedDelay, Slower)]
+    numbers, zeros = np.arange(7), np.zeros(7)
+    for link in (WAY, BACK):
+        many = Transmission(link)._replace(number=numbers, time=zeros, bad=zeros > 0.0)
+        np.testing.assert_array_equal(delivery_probabilities(loss, many), chances(loss, 7, link))
+        for delay in delays:
+            found = checked_delays(delay, many, zeros)
+            np.testing.assert_array_equal(found, seconds(delay, 7, link))

@@ -32,7 +32,7 @@ from netkf.network.delays import (
     LognormalDelay,
     NoDelay,
     UniformDelay,
-    checked_delay,
+    checked_delays,
     delay_depends_on_message,
 )
 from netkf.network.graphs import Link
@@ -332,15 +332,13 @@ def message_delays(
     """Return the outcomes (K,) of the messages ``sent`` on one link."""
     lost = uniform >= channel.deliveries(sent)
     if delay_depends_on_message(channel.delay):
-        delay = delay.copy()
         # A delay is asked only for messages that arrive.
-        distance = np.broadcast_to(sent.distance, lost.shape)
-        for k in np.flatnonzero(~lost).tolist():
-            one = sent._replace(
-                number=int(sent.number[k]), time=float(sent.time[k]), bad=bool(sent.bad[k]),
-                distance=float(distance[k]),
-            )  # fmt: skip
-            delay[k] = checked_delay(channel.delay, one, float(delay[k]))
+        delay, k = delay.copy(), np.flatnonzero(~lost)
+        distance = np.broadcast_to(sent.distance, lost.shape)[k]
+        arriving = sent._replace(
+            number=sent.number[k], time=sent.time[k], bad=sent.bad[k], distance=distance
+        )
+        delay[k] = checked_delays(channel.delay, arriving, delay[k])
     return np.where(lost, LOST, delay)
 
 
