@@ -113,9 +113,9 @@ class DutyCycle(Life):
         self, node: int, random: Callable[[], np.random.Generator], horizon: float
     ) -> Sequence[Change]:
         """Return restarts and crashes in turn, at times counted from ``phase``."""
-        found, first = [], -math.ceil(self.phase / self.period) - 1
-        for k in itertools.count(first):
-            begin = self.phase + k * self.period
+        found, phase = [], math.fmod(self.phase, self.period)
+        for k in itertools.count(-2):
+            begin = phase + k * self.period
             found += [Change(begin, "restart"), Change(begin + self.up, "crash")]
             if begin >= horizon:
                 break

@@ -532,6 +532,7 @@ def test_crashes_have_their_law():
         (1.0, [(1.0, True), (3.0, False), (6.0, True), (8.0, False)]),
         (4.0, [(1.0, False), (4.0, True), (6.0, False), (9.0, True)]),
         (9.0, [(1.0, False), (4.0, True), (6.0, False), (9.0, True)]),
+        (5.0 * 2.0**900, [(2.0, False), (5.0, True), (7.0, False)]),
     ],
 )
 def test_duty_cycles(phase, expected):
