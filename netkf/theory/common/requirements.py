@@ -56,10 +56,10 @@ def scenario_of_estimates(scenario: Scenario) -> Scenario:
     if have_one_view(scenario):
         return scenario_of_view(scenario)
     known = "; of these are known theory.central_covariance and theory.error_covariance"
-    reason = (
-        "not known of nodes that estimate different blocks of the state, or blocks beside others "
-        "that are not drawn or that links follow"
-    )
+    what = "blocks beside others that are not drawn or that links follow"
+    if len(set(scenario.estimated)) > 1:
+        what = "different blocks of the state"
+    reason = f"not known of nodes that estimate {what}"
     raise TheoryError(reason + (known if scenario.is_linear else ""))
 
 
