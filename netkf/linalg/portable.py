@@ -30,7 +30,7 @@ def product(a: FloatArray, b: FloatArray) -> FloatArray:
     if a.shape[-1] == 0:
         shape = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
         return np.zeros((*shape, a.shape[-2], b.shape[-1]))
-    if min(a.shape[-2], a.shape[-1], b.shape[-1]) > MANY:
+    if b.shape[-1] > MANY:
         return _product_of_blocks(a, b)
     # + 0.0: a sum starts with 0, so that a first term of -0 gives +0.
     total: FloatArray = a[..., :, 0, None] * b[..., None, 0, :] + 0.0

@@ -38,6 +38,8 @@ between.
 TOLD, UNREPORTED = "no report tells", "nobody reported it"
 NOT_LOGGED = "its sender logs what it sends, and not this"
 """Reasons for which outcomes are not known."""
+RESTART = -1
+"""What stands for a number of cycles where a counter began anew at any number."""
 LATE = 2
 """A number may be that much smaller than the one before because reports are out of order."""
 MAX_SECONDS = 1e11
@@ -249,24 +251,37 @@ def unwrap(numbers: np.ndarray, times: FloatArray) -> tuple[np.ndarray, int, int
             numbers[k : ends[k]] = numbers[k : ends[k]][turn]
         number = int(numbers[k])
         expected = (time + grain - top_time) / interval if interval and k else 0.0
-        skipped = number + modulus - last
-        falls = k > 0 and number < last - LATE and np.median(numbers[k : k + 8]) < last - LATE
-        turns = _whole_turns(skipped, expected, cycle)
-        is_due = modulus > 0 and (turns or abs(skipped - expected) <= 1.0 + 0.25 * expected)
-        falls |= bool(k > 0 and number <= last and is_due)
-        if falls and modulus and skipped <= 2.0 * expected + 3.0:
-            offset, wraps = offset + (1 + turns) * modulus, wraps + 1 + turns
-        elif falls or (k and MAX_SKIP < number - last > 10.0 * expected and not wraps):
+        coming = numbers[k : k + 8]
+        begun = _cycles_begun(coming, last, expected, modulus, cycle, wraps > 0) if k else 0
+        if begun == RESTART:
             offset, restarts = top + 1 - number, restarts + 1
-        elif k and number > last + 1 and (turns := _whole_turns(number - last, expected, cycle)):
-            offset, wraps = offset + turns * modulus, wraps + turns
+        else:
+            offset, wraps = offset + begun * modulus, wraps + begun
         # One of before the wrap may come late, but not after as much time as it is ahead.
-        is_late = wraps and not falls and number - last > max(0.5 * modulus, 2.0 * expected)
+        is_late = wraps and not begun and number - last > max(0.5 * modulus, 2.0 * expected)
         counter = number + offset - (modulus if is_late else 0)
         counters[place[k]] = counter
         if not k or counter > top:
             top, top_time, last = counter, time, number
     return counters, wraps, modulus, restarts
+
+
+def _cycles_begun(
+    coming: np.ndarray, last: int, expected: float, modulus: int, cycle: int, wrapped: bool
+) -> int:
+    """Return how many cycles of a counter began between ``last`` and the first of the numbers
+    ``coming``, in a time of ``expected`` packets; RESTART if it began anew.
+    """
+    number = int(coming[0])
+    skipped = number + modulus - last
+    turns = _whole_turns(skipped, expected, cycle)
+    is_due = modulus > 0 and (turns or abs(skipped - expected) <= 1.0 + 0.25 * expected)
+    falls = number < last - LATE and np.median(coming) < last - LATE
+    if falls or (number <= last and is_due):
+        return 1 + turns if modulus and skipped <= 2.0 * expected + 3.0 else RESTART
+    if MAX_SKIP < number - last > 10.0 * expected and not wrapped:
+        return RESTART
+    return _whole_turns(number - last, expected, cycle) if number > last + 1 else 0
 
 
 def _whole_turns(step: int, expected: float, cycle: int) -> int:

@@ -25,7 +25,7 @@ from netkf.core.fields import (
 from netkf.core.laws import WaitingLaw, exponential_law, lognormal_law, uniform_law
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Topology
-from netkf.network.losses import Transmission, is_vectorised
+from netkf.network.losses import Transmission, each_message, is_vectorised
 
 _SECONDS = number(low=0.0)
 
@@ -211,14 +211,8 @@ def checked_delays(delay: Delay, sent: Transmission, drawn: FloatArray) -> Float
         seconds = np.asarray(delay.message_delay(sent, drawn), dtype=np.float64)
         if seconds.shape == drawn.shape and not (seconds < 0.0).any():
             return seconds
-    columns = (sent.number, sent.time, sent.bad, np.broadcast_to(sent.distance, drawn.shape))
-    rows = zip(*(np.asarray(c).tolist() for c in (*columns, drawn)), strict=True)
-    return np.array(
-        [
-            checked_delay(delay, sent._replace(number=k, time=t, bad=bad, distance=d), one)
-            for k, t, bad, d, one in rows
-        ]
-    )
+    ones = zip(each_message(sent), drawn.tolist(), strict=True)
+    return np.array([checked_delay(delay, *one) for one in ones])
 
 
 def checked_delay(delay: Delay, sent: Transmission, drawn: float) -> float:

@@ -7,7 +7,7 @@ import inspect
 import itertools
 import math
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
@@ -597,13 +597,14 @@ def delivery_probabilities(loss: Loss, sent: Transmission) -> FloatArray:
     if is_vectorised(loss, "delivery_probability"):
         values = demand_probability(loss, sent, loss.delivery_probability(sent))
         return np.broadcast_to(values, np.shape(sent.number))
-    columns = np.broadcast_arrays(sent.number, sent.time, sent.bad, sent.distance)[1:]
-    rows = zip(sent.number.tolist(), *(c.tolist() for c in columns), strict=True)
-    ones = (
-        sent._replace(number=number, time=time, bad=bad, distance=distance)
-        for number, time, bad, distance in rows
-    )
-    return np.array([checked_delivery_probability(loss, one) for one in ones])
+    return np.array([checked_delivery_probability(loss, one) for one in each_message(sent)])
+
+
+def each_message(sent: Transmission) -> Iterator[Transmission]:
+    """Yield each of the K messages ``sent`` on a link."""
+    columns = np.broadcast_arrays(sent.number, sent.time, sent.bad, sent.distance)
+    for k, t, bad, distance in zip(*(c.tolist() for c in columns), strict=True):
+        yield sent._replace(number=k, time=t, bad=bad, distance=distance)
 
 
 def checked_delivery_probability(loss: Loss, sent: Transmission) -> float:

@@ -78,23 +78,16 @@ class Transitions:
         """Return exp(A g) (K, n, n) by its power series, for K short ``gaps``."""
         n, terms = self.n, len(self._series)
         powers = _powers(gaps, terms)
-        return _sums(powers, self._series.reshape(terms, n * n)).reshape(-1, n, n)
+        return product(powers, self._series.reshape(terms, n * n)).reshape(-1, n, n)
 
     def _unit_noise(self, gaps: FloatArray) -> FloatArray:
         """Return a factor (K, n, 10 m) of the noise covariance over K short ``gaps``."""
         terms, n, m = self._response.shape
         powers = _powers(gaps[:, None] * _NODES, terms)
-        response = _sums(powers, self._response.reshape(terms, n * m))
+        response = product(powers, self._response.reshape(terms, n * m))
         response = response.reshape(-1, len(_NODES), n, m)
         response *= np.sqrt(gaps[:, None] * _WEIGHTS)[:, :, None, None]
         return np.asarray(np.moveaxis(response, 1, 2).reshape(-1, n, len(_NODES) * m))
-
-
-def _sums(powers: FloatArray, series: FloatArray) -> FloatArray:
-    """Return ``powers series`` (K, c, e); entries of ``series`` (terms, e) that are 0 stay so."""
-    sums, used = np.zeros((*powers.shape[:2], series.shape[1])), np.flatnonzero(series.any(axis=0))
-    sums[..., used] = product(powers, series[:, used])
-    return sums
 
 
 def noise_factors(noise: FloatArray) -> tuple[FloatArray, FloatArray]:

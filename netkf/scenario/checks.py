@@ -195,15 +195,20 @@ def _check_sensors(scenario: DerivedScenario) -> None:
             )
 
 
+def _largest_information(sensor: Any) -> float:
+    """Return the largest entry of H' R^-1 H of a linear sensor."""
+    # Columns of states that it does not read are left out: of many blocks most.
+    H = sensor.H[:, sensor.H.any(axis=0)]
+    return float(np.abs(H.T @ np.linalg.solve(sensor.R, H)).max(initial=0.0))
+
+
 def _check_speed(scenario: DerivedScenario) -> None:
     delay = scenario.network.channel.delay.fixed or 0.0
     # A message with a fixed delay is predicted over the delay, which may exceed the horizon.
     longest = max(scenario.horizon, delay)
     believed = scenario.believed_pieces  # A and B B' that the filters assume
-    # Columns of states that a sensor does not read are left out: of many blocks most.
-    read = ((H[:, H.any(axis=0)], s.R) for s in scenario.sensors if s.linear for H in [s.H])
-    informations = (H.T @ np.linalg.solve(R, H) for H, R in read)
-    max_information = max((float(np.abs(G).max(initial=0.0)) for G in informations), default=0.0)
+    linear_sensors = (sensor for sensor in scenario.sensors if sensor.linear)
+    max_information = max(map(_largest_information, linear_sensors), default=0.0)
     filter_rate = np.sqrt(max_information * max(float(np.abs(Q).max()) for _, Q in believed))
     true = [piece.A for piece in scenario.diffusion.pieces]
     A = max(true, key=growth_rate)

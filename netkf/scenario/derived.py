@@ -165,8 +165,7 @@ class DerivedScenario(ScenarioModel):
 
     def seen_part(self, k: int, M: FloatArray) -> FloatArray:
         """Return the rows and columns (n', n') of M (n, n) that node number ``k`` estimates."""
-        view = self.view(k)
-        return np.ascontiguousarray(M[view][:, view])
+        return _part(M, self.view(k))
 
     @cached_property
     def model_pieces(self) -> tuple[tuple[Any, ...], ...]:
@@ -317,7 +316,7 @@ class DerivedScenario(ScenarioModel):
     def _slot_model(self, H: FloatArray, R: FloatArray, view: Any = slice(None)) -> SlotModel:
         plant = self.slot_plant
         if not isinstance(plant, NonlinearPlant):
-            F, Q = (np.ascontiguousarray(M[view][:, view]) for M in self.believed_pieces[0])
+            F, Q = (_part(M, view) for M in self.believed_pieces[0])
             return SlotModel(F, Q, H, R, plant.period)
         (f, jacobian), inputs, F, Q = self._curved(plant, view)
         u = self.believed_inputs[:, inputs]
@@ -327,7 +326,7 @@ class DerivedScenario(ScenarioModel):
 
     def _curved(self, plant: Any, view: Any) -> tuple[Any, ...]:
         """Return f, its Jacobian, the numbers of its inputs, nan, and Q of a ``view``."""
-        F, Q = (np.ascontiguousarray(M[view][:, view]) for M in self.believed_pieces[0])
+        F, Q = (_part(M, view) for M in self.believed_pieces[0])
         if isinstance(view, slice):
             return plant.functions, np.arange(plant.m), F, Q
         return (*plant.functions_of(view), F, Q)
@@ -815,7 +814,7 @@ class DerivedScenario(ScenarioModel):
                 tables_of_input=(times, known * values[:, inputs], sine[:, inputs] * amplitudes),
                 linearise=self.filter.linearise,
             )  # fmt: skip
-        A, Q = (np.ascontiguousarray(M[view][:, view]) for M in self.believed_pieces[0])
+        A, Q = (_part(M, view) for M in self.believed_pieces[0])
         # The longest gap to predict over, and the longest step whose increment is used at once.
         period = self.diffusion.sensing_period or 0.0
         return FlowModel(A, Q, H, R, self.horizon, min(period, self.horizon))
@@ -936,6 +935,11 @@ class DerivedScenario(ScenarioModel):
             "nodes": (sender,),
         }
         return clock.mean_rate(entities[clock.at])
+
+
+def _part(M: FloatArray, view: Any) -> FloatArray:
+    """Return the rows and columns of M (n, n) that a ``view`` of the state has."""
+    return np.ascontiguousarray(M[view][:, view])
 
 
 def _shared(

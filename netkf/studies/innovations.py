@@ -102,17 +102,18 @@ class ClockedInnovations:
             samples.setdefault(node, []).append(times)
         pooled, entries = scenario.node_filter.timing.pooled, len(scenario.nodes) * plant.n**2
         count = min(MAX_INSTANTS, MAX_ENTRIES // (2 * max(1, len(samples)) * entries))
-        # By node the chosen instants, and the last events before them.
-        self._chosen, self._before = dict[int, FloatArray](), dict[int, FloatArray]()
+        # By node (2, K), the chosen instants and the last events before them.
+        self._instants = dict[int, FloatArray]()
         for node, of_sensors in samples.items():
             every = np.unique(np.concatenate(of_sensors))
             every = every[(every > 0.0) & (every < scenario.horizon)]
-            chosen = np.linspace(0, len(every) - 1, count if len(every) else 0)
-            self._chosen[node] = every[np.unique(chosen.astype(int))]
+            number = np.linspace(0, len(every) - 1, count if len(every) else 0)
+            chosen = every[np.unique(number.astype(int))]
             is_own = pooled | (log["node"] == node) | (log["peer"] == node)
             events = np.unique(np.append(log["t"][is_own], 0.0))
-            self._before[node] = events[np.searchsorted(events, self._chosen[node]) - 1]
-        parts = [*self._chosen.values(), *self._before.values()]
+            before = events[np.searchsorted(events, chosen) - 1]
+            self._instants[node] = np.stack([chosen, before])
+        parts = [pairs.ravel() for pairs in self._instants.values()]
         self.times = np.unique(np.concatenate([scenario.times, *parts]))
 
     def of_block(self, block: JudgedBlock, blurred: np.ndarray) -> Iterator[tuple[float, float]]:
@@ -121,9 +122,8 @@ class ClockedInnovations:
         x, view, own = run.x, scenario.view(i), scenario.is_estimated[i]
         if scenario.knows_input:
             x = x - scenario.believed_response.states(run.times)
-        node, none = scenario.nodes[i], np.empty(0)
-        pairs = [of_nodes.get(node, none).tolist() for of_nodes in (self._chosen, self._before)]
-        for time, start in zip(*pairs, strict=True):
+        pairs = self._instants.get(scenario.nodes[i], np.empty((2, 0)))
+        for time, start in pairs.T.tolist():
             now, last = np.searchsorted(run.times, [time, start]).tolist()
             if time not in readings or now >= len(run.times) or blurred[last]:
                 continue
