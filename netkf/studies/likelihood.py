@@ -37,8 +37,8 @@ from netkf.scenario.scenario import Scenario
 if TYPE_CHECKING:
     import pandas as pd
 
-RANGE = 30.0
-"""Largest change of the logarithm of a variance that is searched."""
+RANGE, STRIDE = 30.0, 2.0
+"""Largest change of the logarithm of a variance that is searched, and that of one search."""
 NEGLIGIBLE = 1e-6
 """Loss of log-likelihood below which a variance is 0 as far as the readings can tell."""
 UNKNOWN = 10.0
@@ -221,6 +221,7 @@ def _require_central(scenario: Scenario) -> None:
         (scenario.increment_sensors, "sensors", increments, "write sampling = { kind = ... }"),
         (len(plant.changes), "plant.schedule", "would be a second model", "fit each by itself"),
         (scenario.network.lives, "network.lives", "would leave out readings", leave_out),
+        (scenario.network.clocks, "network.clocks", "would date readings wrongly", leave_out),
         (scenario.misses_input, "filter.model.input", "must be true: no noise", leave_out),
     ):
         if wrong:
@@ -382,17 +383,22 @@ def _climb(value: Callable[[FloatArray], float], start: FloatArray) -> FloatArra
     def loss(theta: Any) -> float:
         return -max(value(np.exp(theta)), -1e300)
 
-    bounds = [(one - RANGE, one + RANGE) for one in start]
-    theta = minimize(loss, start, jac=partial(_gradient, loss), method="L-BFGS-B", bounds=bounds).x
+    theta, gradient = start, partial(_gradient, loss)
+    for _ in range(int(RANGE / STRIDE)):
+        # A longer step can end where rounding leaves no likelihood, and a search ends with it.
+        bounds, last = [(one - STRIDE, one + STRIDE) for one in theta], theta
+        theta = minimize(loss, last, jac=gradient, method="L-BFGS-B", bounds=bounds).x
+        if np.abs(theta - last).max() < 0.5 * STRIDE:
+            break
     for _ in range(5):
-        gradient, curvature = _gradient(loss, theta), _hessian(loss, theta)
+        slope, curvature = gradient(theta), _hessian(loss, theta)
         # A variance of 0 has no curvature.
         moving = np.abs(np.diag(curvature)) > 1e-6
         step = np.zeros_like(theta)
         block = curvature[np.ix_(moving, moving)]
         if not moving.any() or np.linalg.eigvalsh(block).min() <= 0.0:
             break
-        step[moving] = np.linalg.solve(block, gradient[moving])
+        step[moving] = np.linalg.solve(block, slope[moving])
         if not loss(theta - step) <= loss(theta):
             break
         theta = theta - step

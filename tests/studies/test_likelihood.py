@@ -142,6 +142,18 @@ def test_intervals_hold_and_a_wrong_start_does_not_matter(tmp_path):
     np.testing.assert_allclose(again["value"], found["value"], rtol=1e-5)
 
 
+def test_the_fit_is_likelier_than_the_truth_wherever_it_starts(tmp_path):
+    """From a wrong start a first step can go so far that rounding leaves no likelihood."""
+    plant = {"kind": "linear", "F": [[0.7, 0.3], [-0.2, 0.6]], "Q": [[0.5, 0.0], [0.0, 0.8]]}
+    plant |= {"period": 1.0, "cov": [[1.0, 0.0], [0.0, 1.0]]}
+    sensor = {"nodes": [0, 1], "H": [[1.0, 0.0], [0.5, 1.0]], "R": [[0.4, 0.0], [0.0, 0.3]]}
+    given = scenario(tmp_path, plant, sensor, 150.0)
+    model = {"Q": [[5.0, 0.0], [0.0, 0.08]], "R": [[1.2, 0.0], [0.0, 0.3]]}
+    for seed in range(3):
+        found = fit_noise(given.replace({"filter.model": model}), seed)
+        assert found.log_likelihood >= log_likelihood(given, seed)
+
+
 def test_a_variance_that_readings_deny_is_zero(tmp_path):
     plant = {"kind": "linear", "F": [[1.0]], "Q": [[0.0]], "period": 1.0, "cov": [[1.0]]}
     given = scenario(tmp_path, plant, {"H": [[1.0]], "R": [[1.0]]}, 50.0)
@@ -180,6 +192,10 @@ def test_blocks_of_one_name_share_a_variance(tmp_path):
         ({"sensors.0.sampling": None}, "sensors"),
         ({"plant.schedule": [{"from": 5.0, "A": [[0.0, 1.0], [-2.0, 0.0]]}]}, "plant.schedule"),
         ({"filter.model": {"input": False}}, "filter.model.input"),
+        (
+            {"plant.input": None, "network.clocks": [{"nodes": [0], "offset": 0.1}]},
+            "network.clocks: would date",
+        ),
     ],
 )
 def test_what_has_no_one_linear_model_is_refused(tmp_path, changes, key):
