@@ -567,8 +567,17 @@ def _delay_table(scenario: Scenario, table: pd.DataFrame, notes: list[str]) -> d
     if sigma < SAME_DELAY:
         notes.append(f"delays: all are {mean:.3g} s")
         return {"kind": "constant", "seconds": mean}
-    notes.append(f"delays: fitted as lognormal with mean {mean:.3g} s, sigma {sigma:.3g}")
-    return {"kind": "lognormal", "mean": mean, "sigma": sigma}
+    low, high, count = float(seconds.min()), float(seconds.max()), len(seconds)
+    second = 0.5 * math.log(count)  # what a second parameter costs, as in bic
+    lognormal = -count * math.log(sigma * math.sqrt(2.0 * math.pi * math.e)) - second
+    _, kind, values = max(
+        (lognormal - float(np.log(seconds).sum()), "lognormal", {"mean": mean, "sigma": sigma}),
+        (-count * (1.0 + math.log(mean)), "exponential", {"mean": mean}),
+        (-count * math.log(high - low) - second, "uniform", {"low": low, "high": high}),
+    )
+    told = ", ".join(f"{key} {value:.3g}" for key, value in values.items())
+    notes.append(f"delays: likeliest of exponential, lognormal and uniform is {kind}, {told}")
+    return {"kind": kind, **values}
 
 
 def _write(

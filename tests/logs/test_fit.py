@@ -24,6 +24,7 @@ from netkf.logs.outcomes import (
     shared_fate,
 )
 from netkf.logs.outcomes import test_time as time_test
+from netkf.scenario.writing import as_table
 from tests.conftest import SCENARIOS
 
 LEVEL = 0.05
@@ -416,3 +417,26 @@ def test_delays_of_one_length_are_constant_and_those_of_none_are_counted(tmp_pat
     delay = netkf.load(found.scenarios["bernoulli"]).network.channel.delay
     assert delay.seconds == pytest.approx(0.3, abs=1e-12)
     assert any("4 of 10 delays are 0" in note for note in found.notes) == (shares[1] > 0.0)
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        {"kind": "lognormal", "mean": 0.3, "sigma": 0.5},
+        {"kind": "exponential", "mean": 0.2},
+        {"kind": "uniform", "low": 0.1, "high": 0.3},
+    ],
+)
+def test_delays_have_the_law_they_were_drawn_from(tmp_path, law):
+    random, rows = np.random.default_rng(1), ["t,sender,receiver,number,heard,t_heard"]
+    kind, *values = law.values()
+    if kind == "lognormal":
+        values[0] = np.log(values[0]) - 0.5 * values[1] ** 2
+    delays = getattr(random, kind)(*values, size=400)
+    rows += [f"{k},a,b,{k},1,{k + delay:.9f}" for k, delay in enumerate(delays)]
+    (tmp_path / "log.csv").write_text("\n".join(rows))
+    netkf.import_log(tmp_path / "log.csv", "csv", tmp_path / "made")
+    found = netkf.fit_log(tmp_path / "made", runs=0)
+    delay = as_table(netkf.load(found.scenarios["bernoulli"]))["network"]["channel"]["delay"]
+    assert delay.pop("kind") == kind
+    assert delay == pytest.approx({key: law[key] for key in delay}, rel=0.1)
