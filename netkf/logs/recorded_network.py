@@ -84,7 +84,7 @@ def write_network(
     """Return the files of a log called ``name``, and notes; see ``settle`` for ``hole`` and
     ``unreported``, ``like`` replaces plant, sensors and filter. Raises ScenarioError.
     """
-    rename_nodes(log)
+    rename_nodes(log, {str(node) for node in like.nodes} if like else set())
     if like is not None:
         _begin_with(like, log)
     outcomes = settle(log, hole, unreported)
@@ -147,8 +147,8 @@ def _note_totals(log: PacketLog, account: pd.DataFrame) -> None:
         )
 
 
-def rename_nodes(log: PacketLog) -> None:
-    """Give nodes names that tables can hold: no blanks, quotes or signs of comments."""
+def rename_nodes(log: PacketLog, known: set[str]) -> None:
+    """Give nodes but those ``known`` names that tables can hold: no blanks, quotes or #."""
     nodes = sorted({*log.sends["sender"], *log.outcomes["receiver"]})
     names = {node: re.sub(r"[^\w.:+-]", "_", node) for node in nodes}
     if all(re.fullmatch(r"\d{1,15}", node) for node in nodes):
@@ -157,7 +157,9 @@ def rename_nodes(log: PacketLog) -> None:
         names = {n: f"n{name}" if is_number(name) else name for n, name in names.items()}
     if len(set(names.values())) < len(nodes):
         names = {node: f"n{k}" for k, node in enumerate(nodes)}
-    changed = {a: b for a, b in names.items() if a != b}
+    # A row that begins with # is a comment; of other names tables hold all.
+    kept = {name for name in known if not name.startswith("#")}
+    changed = {a: b for a, b in names.items() if a != b and a not in kept}
     if not changed:
         return
     listed = ", ".join(f"{a} is {b}" for a, b in list(changed.items())[:5])

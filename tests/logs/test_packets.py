@@ -2,6 +2,7 @@
 
 from decimal import Decimal
 
+import networkx
 import numpy as np
 import pandas as pd
 import pytest
@@ -669,6 +670,22 @@ def test_a_log_may_take_the_plant_of_a_scenario(tmp_path):
     (tmp_path / "run" / "down.toml").write_text(to_toml(as_table(netkf.load(like, lives))))
     _, notes = netkf.import_log(log, "csv", tmp_path / "b", like=tmp_path / "run" / "down.toml")
     assert any("a node that is down does not send what it sent" in note for note in notes)
+
+
+def test_nodes_of_any_name_return_from_a_log(tmp_path):
+    """Their names are those of --like, which stand beside their log."""
+    graph = networkx.relabel_nodes(networkx.path_graph(4), {0: "nœud 1", 1: "a,b;'c", 2: "7"})
+    changes = {"network.graph": graph, "sensors.0.nodes": ["nœud 1", "7"], "horizon": 4.0}
+    loss = {"loss": {"kind": "bernoulli", "delivery": 0.6}, "symmetric": False}
+    scenario = netkf.load(SCENARIOS / "poisson_ring.toml", changes | {"network.channel": loss})
+    run = netkf.simulate(scenario, engine="simpy")
+    netkf.save(run, scenario, tmp_path / "run")
+    netkf.export_log(run, tmp_path / "log")
+    like = tmp_path / "run" / "scenario.toml"
+    netkf.import_log(tmp_path / "log", "csv", tmp_path / "out", like=like)
+    again = netkf.simulate(netkf.load(tmp_path / "out" / "scenario.toml"), engine="simpy")
+    pd.testing.assert_frame_equal(run.states, again.states, check_exact=True)
+    assert run.events.equals(again.events)
 
 
 def test_the_origin_and_decimals_of_stamps_are_kept(tmp_path):
