@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import shlex
 from typing import Any
 
 NEXT = {
@@ -50,9 +51,10 @@ def _write_folder(run: Any, options: argparse.Namespace) -> int:
     *files, last = (export_recorded if recorded else export_log)(run, options.out)
     print(f"written: {last} with {', '.join(path.name for path in files)}")
     if recorded:
-        print(f"next: netkf run {last}" + f" --replica {run.replica}" * bool(run.replica))
+        replica = f" --replica {run.replica}" * bool(run.replica)
+        print(f"next: netkf run {shlex.quote(str(last))}{replica}")
     else:
-        print(f"next: netkf import {options.out} --kind csv --out DIR")
+        print(f"next: netkf import {shlex.quote(str(options.out))} --kind csv --out DIR")
     return 0
 
 

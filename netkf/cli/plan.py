@@ -62,7 +62,8 @@ def print_plan(
     # With a script on standard output, what a person reads goes beside it.
     out = sys.stderr if options.slurm else sys.stdout
     print(f"{what} for {count_phrase(tasks, 'job')}, none of them simulated", file=out)
-    print(f"each: netkf work {directory}; in the end: netkf merge {directory}", file=out)
+    quoted = shlex.quote(str(directory))
+    print(f"each: netkf work {quoted}; in the end: netkf merge {quoted}", file=out)
     print(f"written to {directory}", file=out)
     if options.slurm:
         print(_array(directory.resolve(), scenario.name, tasks, options), end="")
@@ -79,7 +80,7 @@ def _array(directory: Path, name: str, tasks: int, options: argparse.Namespace) 
         tasks=tasks,
         hours=minutes // 60,
         minutes=minutes % 60,
-        log=str(directory.parent / f"{directory.name}-%A_%a.log"),
+        log=shlex.quote(str(directory.parent / f"{directory.name}-%A_%a.log")),
         work=shlex.join(["netkf", "work", str(directory), "--for", limit, *trust]),
         merge=shlex.join(["netkf", "merge", str(directory), *trust]),
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import sys
 from collections.abc import Iterable
 from importlib.util import find_spec
@@ -48,7 +49,8 @@ def run_new(options: argparse.Namespace) -> int:
     scenario, tests = write_template(options.name, options.folder)
     print(f"written: {scenario} and {tests}")
     installation = "" if find_spec("pytest") else "pip install pytest; "
-    print(f"next: netkf run {scenario}; {installation}pytest {tests}")
+    run, test = shlex.join(["netkf", "run", str(scenario)]), shlex.join(["pytest", str(tests)])
+    print(f"next: {run}; {installation}{test}")
     return 0
 
 
@@ -99,7 +101,7 @@ def run_import(options: argparse.Namespace) -> int:
     print(f"written: {files[0]} with {', '.join(path.name for path in files[1:])}")
     for note in notes:
         print(note if ": " in note[:14] else f"note: {note}")
-    print(f"next: netkf run {files[0]}")
+    print(f"next: netkf run {shlex.quote(str(files[0]))}")
     return 0
 
 

@@ -7,6 +7,7 @@ it, ``netkf work`` adds blocks of runs without a result, and ``netkf merge`` tur
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -164,7 +165,7 @@ def work_on_plan(
         ):
             replicate_blocks(task, merge, scenario, identity.runs, pool=workers, store=store)
     except KeyboardInterrupt:
-        remedy = f"; go on with netkf work {plan.directory}"
+        remedy = f"; go on with netkf work {shlex.quote(str(plan.directory))}"
         raise InterruptedRunError(plan.directory, remedy) from None
     return WorkDone(replicas, worker.simulated, worker.left)
 

@@ -6,6 +6,7 @@ import json
 import os
 import random
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -365,9 +366,15 @@ def test_a_job_has_time_beside_its_start_and_end(tmp_path, capsys):
 def test_slurm_script(tmp_path, capsys):
     line = ["--out", str(tmp_path / "my plan"), "--tasks", "8", "--slurm", "--time", "01:30:00"]
     assert main(["plan", *LINE, *line]) == 0
-    script = capsys.readouterr().out
+    script, said = capsys.readouterr()
     for words in ("--array=0-7", "--signal=TERM@", "--requeue", "--time=01:30:00", "--for 88m"):
         assert words in script
+    # Commands and options that are to be copied have paths as a shell reads them.
+    (log,) = (text for text in script.split("\n") if text.startswith("#SBATCH --output"))
+    assert shlex.split(log, comments=False)[1:] == [f"--output={tmp_path / 'my plan'}-%A_%a.log"]
+    assert f"each: {shlex.join(['netkf', 'work', str(tmp_path / 'my plan')])};" in said
+    assert main(["merge", str(tmp_path / "my plan")]) == 1
+    assert f"go on with netkf work '{tmp_path / 'my plan'}', or" in capsys.readouterr().out
     shell = shutil.which("bash")
     # sbatch --array=0-1 submits two of the eight again.
     srun, job = 'srun() { printf "%s\\n" "$@"; }\n', {**os.environ, "SLURM_ARRAY_TASK_ID": "1"}
