@@ -362,8 +362,7 @@ def read_content(source: SourceFile) -> bytes:
     """
     try:
         with source.full.open("rb") as packed:
-            is_packed = packed.read(2) == b"\x1f\x8b"
-            packed.seek(0)
+            is_packed = packed.peek(2)[:2] == b"\x1f\x8b"
             return _Bounded(gzip.GzipFile(fileobj=packed) if is_packed else packed).readall() or b""
     except _TooLargeError:
         rule = f"{source.name} must have at most {MAX_BYTES >> 20} MiB"
@@ -381,8 +380,7 @@ def open_table(source: SourceFile) -> Iterator[_Sheet]:
     start = b""
     try:
         with source.full.open("rb") as packed:
-            start = packed.read(2)
-            packed.seek(0)
+            start = packed.peek(2)[:2]  # pipes cannot go back
             is_packed = start == b"\x1f\x8b"
             unpacked = gzip.GzipFile(fileobj=packed) if is_packed else packed
             buffered = io.BufferedReader(_Bounded(unpacked), 1 << 16)

@@ -103,6 +103,8 @@ def open_plan(directory: Path, trust: bool = False) -> Plan:
     try:
         manifest = read_manifest(directory, "DIR")
         check_seal(manifest)
+        if "scenario" not in manifest:
+            raise DamagedError("it is the directory of a single run or of a study")
         scenario = load(directory / "scenario.toml", trust=trust)
         if scenario_digest(scenario) != manifest.get("scenario"):
             raise DamagedError("scenario.toml or its files were changed since")

@@ -258,6 +258,9 @@ def test_what_is_no_plan_is_refused_in_one_line(plan, tmp_path, capsys):
         with pytest.raises(SystemExit):
             main(["work", str(plan), *bad])
         assert len(capsys.readouterr().err.splitlines()) == 1
+    run = netkf.simulate(netkf.load(RING, {"horizon": 1.0}), engine="simpy")
+    assert work(netkf.save(run, run.scenario, tmp_path / "single")) == 2
+    assert "it is the directory of a single run" in capsys.readouterr().err
 
 
 def test_a_full_disk_keeps_what_was_written(plan, whole, monkeypatch, capsys):

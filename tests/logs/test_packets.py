@@ -1,5 +1,7 @@
 """Packet logs: what they say is in the tables, and nothing else; a run comes back to the bit."""
 
+import gzip
+import os
 from decimal import Decimal
 
 import networkx
@@ -732,6 +734,16 @@ def test_stamps_too_large_for_seconds_have_the_unit_of_their_size(tmp_path, unit
     assert f"used: log.csv: timestamp is in {unit} since 1970, by its size" in notes
     assert "origin: simulated 0 is 1700000000 in the log" in notes
     assert table(tmp_path / "out", "transmissions.csv")["t"].tolist() == [0.25, 1.5]
+
+
+@pytest.mark.parametrize("pack", [bytes, gzip.compress])
+def test_a_log_may_come_through_a_pipe(tmp_path, pack):
+    read, written = os.pipe()
+    os.write(written, pack(b"t,src,dst\n1,a,b\n2,b,a\n"))
+    os.close(written)
+    netkf.import_log(f"/dev/fd/{read}", "csv", tmp_path / "out")
+    os.close(read)
+    assert table(tmp_path / "out", "transmissions.csv")["node"].tolist() == ["a", "b"]
 
 
 def test_a_column_of_arrivals_may_be_empty(tmp_path):
