@@ -576,7 +576,7 @@ def _delay_table(scenario: Scenario, table: pd.DataFrame, notes: list[str]) -> d
         (-count * math.log(high - low) - second, "uniform", {"low": low, "high": high}),
     )
     told = ", ".join(f"{key} {value:.3g}" for key, value in values.items())
-    notes.append(f"delays: likeliest of exponential, lognormal and uniform is {kind}, {told}")
+    notes.append(f"delays (s): likeliest of exponential, lognormal and uniform is {kind}, {told}")
     return {"kind": kind, **values}
 
 

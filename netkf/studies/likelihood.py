@@ -45,6 +45,8 @@ UNKNOWN = 10.0
 """Standard error of the logarithm of a variance from which on it is unknown."""
 STARTS = (0.0, -4.0, 4.0)
 """Changes of the logarithms of the variances of plant and sensors that are tried at first."""
+LEAPS, MAX_CLIMBS = (4.0, 8.0, 12.0), 10
+"""Changes of the logarithm of one variance that are tried where a climb ends."""
 
 
 class Variance(NamedTuple):
@@ -362,10 +364,18 @@ def fit_noise(
     shifts = [np.where(is_plant, one, other) for one, other in itertools.product(STARTS, STARTS)]
     start = max(shifts, key=lambda theta: model.value(np.exp(theta)))
     best = _climb(model.value, start)
+    leaps = np.kron(np.eye(count), np.transpose([LEAPS]))
+    for _ in range(MAX_CLIMBS):
+        # A variance that is far too small does not slope.
+        leap = max(best + leaps, key=lambda theta: model.value(np.exp(theta)))
+        if model.value(np.exp(leap)) <= model.value(np.exp(best)) + NEGLIGIBLE:
+            break
+        best = _climb(model.value, leap)
     factors, free = np.exp(best), np.ones(count, dtype=bool)
     top, zero = model.value(factors), list[str]()
     for k, one in enumerate(model.variances):
-        without, more = (np.where(np.arange(count) == k, f * factors, factors) for f in (0, 100))
+        others = np.arange(count) != k
+        without, more = (np.where(others, factors, f) for f in (0.0, 100.0 * max(factors[k], 1.0)))
         free[k] = model.value(without) < top - NEGLIGIBLE
         if not free[k] and model.value(more) >= top - NEGLIGIBLE:
             factors[k] = 1.0  # readings say nothing of it

@@ -143,15 +143,18 @@ def test_intervals_hold_and_a_wrong_start_does_not_matter(tmp_path):
 
 
 def test_the_fit_is_likelier_than_the_truth_wherever_it_starts(tmp_path):
-    """From a wrong start a first step can go so far that rounding leaves no likelihood."""
+    """From a wrong start a first step can go so far that rounding leaves no likelihood, and a
+    variance that is far too small does not slope.
+    """
     plant = {"kind": "linear", "F": [[0.7, 0.3], [-0.2, 0.6]], "Q": [[0.5, 0.0], [0.0, 0.8]]}
     plant |= {"period": 1.0, "cov": [[1.0, 0.0], [0.0, 1.0]]}
     sensor = {"nodes": [0, 1], "H": [[1.0, 0.0], [0.5, 1.0]], "R": [[0.4, 0.0], [0.0, 0.3]]}
     given = scenario(tmp_path, plant, sensor, 150.0)
-    model = {"Q": [[5.0, 0.0], [0.0, 0.08]], "R": [[1.2, 0.0], [0.0, 0.3]]}
-    for seed in range(3):
-        found = fit_noise(given.replace({"filter.model": model}), seed)
-        assert found.log_likelihood >= log_likelihood(given, seed)
+    for q0, q1, r0, r1 in ((5.0, 0.08, 1.2, 0.3), (5e3, 4e-5, 20.0, 0.15), (5e-6, 4e3, 1e-3, 10.0)):
+        model = {"Q": [[q0, 0.0], [0.0, q1]], "R": [[r0, 0.0], [0.0, r1]]}
+        for seed in range(3):
+            found = fit_noise(given.replace({"filter.model": model}), seed)
+            assert found.log_likelihood >= log_likelihood(given, seed)
 
 
 def test_a_variance_that_readings_deny_is_zero(tmp_path):
