@@ -200,7 +200,7 @@ def recorded_innovations(run: Run) -> Innovations:
         try:
             return CentralModel(scenario, run.seed, run.replica).as_innovations()
         except ScenarioError:
-            pass  # increments, or a model that changes
+            pass  # increments, a model that changes, or readings that are too large
     return compute_innovations(run)
 
 

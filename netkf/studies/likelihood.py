@@ -33,6 +33,7 @@ from netkf.runs.readings import Readings, collect_readings
 from netkf.runs.simulate import require_scenario
 from netkf.scenario.model import PlacedSensor
 from netkf.scenario.scenario import Scenario
+from netkf.trace.nees import BLUR, ROUNDING
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -109,7 +110,9 @@ class CentralModel:
     """
 
     def __init__(self, scenario: Scenario, seed: int, replica: int) -> None:
-        """Raises ScenarioError for a model that is not linear, or that changes."""
+        """Raises ScenarioError for a model that is not linear, or that changes, and for readings
+        whose noise rounding hides, as those of unstable plants in the end.
+        """
         _require_central(scenario)
         filtering = dataclasses.replace(scenario.filter, algorithm=Central(), estimates="all")
         network = dataclasses.replace(scenario.network, activation=None, radio=None)
@@ -121,6 +124,12 @@ class CentralModel:
         self.variances = tuple(_plant_variances(central)) + tuple(_sensor_variances(central))
         self._lay_rows(central, got)
         self._lay_laws(central, got.times)
+        _, S = self.innovations(np.ones(len(self.variances)))
+        # In units of the noise S is at least 1.
+        largest = float(np.max(abs(self.y) / np.sqrt(np.maximum(S, 1.0))))
+        if largest * ROUNDING * BLUR > 1.0:
+            rule, remedy = "give readings too large for rounding to leave", "shorten the horizon"
+            raise ScenarioError("sensors", f"{rule} their noise", largest, remedy)
 
     def _lay_rows(self, scenario: Scenario, got: Readings) -> None:
         """Lay out scalar readings: those of a noise that is not diagonal are decorrelated."""
@@ -327,7 +336,8 @@ def log_likelihood(scenario: Scenario, seed: int | None = None, replica: int = 0
     together, under the linear model that the filters believe, whatever the filter and the network:
     the log density of the innovations of the central Kalman filter.
 
-    Raises ScenarioError for a model that is not linear, or that changes, and for increments.
+    Raises ScenarioError for a model that is not linear, or that changes, for increments, and for
+    readings whose noise rounding hides.
     """
     model = _central_model(scenario, seed, replica)
     return model.value(np.ones(len(model.variances)))

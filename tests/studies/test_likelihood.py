@@ -210,6 +210,15 @@ def test_what_has_no_one_linear_model_is_refused(tmp_path, changes, key):
         log_likelihood(given.replace(changes))
 
 
+def test_rounding_of_large_readings_is_not_taken_for_noise(tmp_path):
+    """Those of an unstable plant: no likelihood has their noise, innovations from errors do."""
+    plant = {"kind": "linear", "F": [[1.5]], "Q": [[1.0]], "period": 1.0, "cov": [[1.0]]}
+    given = scenario(tmp_path, plant, {"H": [[1.0]], "R": [[0.5]]}, 150.0)
+    with pytest.raises(ScenarioError, match=r"^sensors: give readings too large for rounding"):
+        fit_noise(given)
+    assert netkf.innovations(given.replace({"filter": {"kind": "central"}}))
+
+
 def test_the_command_prints_the_model_that_the_scenario_may_take(level, tmp_path, capsys):
     path = tmp_path / "level.toml"
     path.write_text(to_toml(as_table(level)))
