@@ -206,6 +206,7 @@ class _Entries:
             value = math.nan
         if not math.isfinite(value):
             remedy = "write a decimal point, no commas" if "," in text else "correct the entry"
+            remedy += ", or leave it empty if it is missing" * may_miss
             raise self._refusal(column, "must be a finite number", remedy)
         return self._limited(column, value)
 

@@ -79,3 +79,5 @@ def test_every_column_of_every_table_refuses_what_is_no_number(tmp_path, name, v
         assert f"{name} line 2" in line
         assert column in line
         assert line.isprintable()
+        if column == "y0" and value != "1e31":
+            assert "leave it empty if it is missing" in line
