@@ -143,7 +143,7 @@ def _late(module: str, name: str) -> Any:
     return call
 
 
-WINGS.promise_traces = _late("netkf.theory.traces", "promise_traces")
+WINGS.promise_traces = _late("netkf.theory.traces", "theory_traces")
 WINGS.draw = _late("netkf.figures.catalogue", "plot")
 WINGS.to_xarray = _late("netkf.neighbours.datasets", "to_xarray")
 WINGS.to_stonesoup = _late("netkf.neighbours.stone_soup", "to_stonesoup")

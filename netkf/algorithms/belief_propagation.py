@@ -32,7 +32,7 @@ import numpy as np
 from netkf.algorithms.filter import Filter, NodeInfo
 from netkf.algorithms.kernels.constant_gains import fill_inverse_transition
 from netkf.algorithms.kernels.estimates import copy_vector, transform_root
-from netkf.algorithms.kernels.information import clear_part, copy_part
+from netkf.algorithms.kernels.information import clear_part, copy_information_root
 from netkf.algorithms.kernels.intersection import finish_lanes, invert_lanes, merge_lanes
 from netkf.algorithms.kernels.run import ALL as ALL_RECEIVERS
 from netkf.algorithms.kernels.run import carry_mean, predict_estimate, shift_vector
@@ -65,7 +65,7 @@ def add_part(
     lanes: Lanes, size: Size, total: FloatArray, part: FloatArray, work: FloatArray
 ) -> None:
     """Add the independent evidence ``part`` to ``total``; ``work`` is scratch of that shape."""
-    copy_part(lanes, part, work)
+    copy_information_root(lanes, part, work)
     merge_lanes(lanes, size, total, work)
 
 
@@ -95,7 +95,7 @@ def predict_part(
             store(lanes, work, n - 1, j, entry)
         store(lanes, work, n - 1, n, load(lanes, part, k, n))
         merge_lanes(lanes, size, total, work)
-    copy_part(lanes, total, part)
+    copy_information_root(lanes, total, part)
 
 
 @kernel
@@ -225,7 +225,7 @@ def believe(record: Any, h: int, run: Any) -> None:
     # From all evidence, and not as an update of the old belief: on an unstable plant the old one
     # may be so far off that digits are lost.
     lanes, n, total, work, W = run.lanes, len(run.size), run.total, run.whitened, record.W
-    copy_part(lanes, record.prior[h], total)
+    copy_information_root(lanes, record.prior[h], total)
     add_part(lanes, run.size, total, record.own[h], work)
     for w in range(run.first[h], run.first[h + 1]):
         add_part(lanes, run.size, total, record.received[w], work)
@@ -256,7 +256,7 @@ def emit(record: Any, h: int, m: int, run: Any) -> None:
     first, stop = run.first[h], run.first[h + 1]
     if run.receiver != ALL_RECEIVERS:
         write_centre(record, h, m, run)
-        copy_part(lanes, record.own[h], evidence[m])
+        copy_information_root(lanes, record.own[h], evidence[m])
         for w in range(first, stop):
             if w != run.receiver:
                 add_part(lanes, run.size, evidence[m], record.received[w], work)
@@ -264,18 +264,18 @@ def emit(record: Any, h: int, m: int, run: Any) -> None:
     D = stop - first
     for k in range(D + 1):
         write_centre(record, h, m + k, run)
-        copy_part(lanes, record.own[h], evidence[m + k])
+        copy_information_root(lanes, record.own[h], evidence[m + k])
     if record.keeps == 0 and run.step == 0:
         # Nothing was received so far.
         return
     # The sum without link k is a prefix sum plus a suffix sum: nothing is subtracted.
     suffix, prefix = record.suffix, evidence[m + D]
     for k in range(D - 1, 0, -1):
-        copy_part(lanes, record.received[first + k], suffix[k])
+        copy_information_root(lanes, record.received[first + k], suffix[k])
         if k < D - 1:
             add_part(lanes, run.size, suffix[k], suffix[k + 1], work)
     for k in range(D):
-        copy_part(lanes, prefix, evidence[m + k])
+        copy_information_root(lanes, prefix, evidence[m + k])
         if k < D - 1:
             add_part(lanes, run.size, evidence[m + k], suffix[k + 1], work)
         add_part(lanes, run.size, prefix, record.received[first + k], work)
@@ -302,7 +302,7 @@ def absorb(record: Any, h: int, run: Any) -> None:
                 continue
             record.heard_at[w, 0] = sent
             predict_message(record, m, run, run.age[k])
-        receive(record, h, m, w, run, load_flags(run.lanes, run.arrived, k))
+        replace_evidence(record, h, m, w, run, load_flags(run.lanes, run.arrived, k))
     if record.clocked == 1 or run.step == record.steps - 1:
         believe(record, h, run)
 
@@ -319,7 +319,7 @@ def predict_message(record: Any, m: int, run: Any, age: float) -> None:
 
 
 @kernel
-def receive(record: Any, h: int, m: int, w: int, run: Any, arrived: Any) -> None:
+def replace_evidence(record: Any, h: int, m: int, w: int, run: Any, arrived: Any) -> None:
     """Replace the evidence received on link ``w`` by that of payload ``m``, relative to the centre
     of node ``h``, in the lanes in which it has ``arrived``.
     """

@@ -39,7 +39,7 @@ ROUNDING = 1e-9
 """Relative deviation of traces that rounding explains."""
 
 
-class Path(NamedTuple):
+class JointEstimate(NamedTuple):
     """What is known of states at several instants: ``x`` (K n,) with covariance P (K n, K n)."""
 
     x: FloatArray
@@ -57,7 +57,7 @@ class PathState(NamedTuple):
     ``now`` is the time of its last readings.
     """
 
-    own: Path
+    own: JointEstimate
     times: tuple[float, ...]
     heard: Mapping[int, Rows]
     sent: Mapping[int, float]
@@ -72,14 +72,14 @@ class PathState(NamedTuple):
         """The number of states of the node's blocks."""
         return len(self.own.x) // (len(self.times) + 1)
 
-    def belief(self, without: int | None = None) -> Path:
+    def belief(self, without: int | None = None) -> JointEstimate:
         """Return all evidence together, or all but that of the sender ``without``."""
         evidence = [rows for sender, rows in self.heard.items() if sender != without]
         if not evidence:
             return self.own
         z, H, R = stacked(evidence, self.own.x[: -self.n])
         x, P, _ = updated(*self.own, Rows(z, np.pad(H, ((0, 0), (0, self.n))), R))
-        return Path(x, P)
+        return JointEstimate(x, P)
 
     @property
     def uncertainty(self) -> float:
@@ -104,7 +104,7 @@ class PathState(NamedTuple):
                 heard[sender] = Rows(rest.T @ z, rest.T @ later, np.eye(rest.shape[1]))
         if full:
             order, times = order[n:], times[1:]
-        own = Path(self.own.x[order], self.own.P[np.ix_(order, order)])
+        own = JointEstimate(self.own.x[order], self.own.P[np.ix_(order, order)])
         seen = tuple(one for one in self.seen if one[0] >= times[0])
         return self._replace(own=own, times=times, heard=heard, seen=seen)
 
@@ -116,8 +116,8 @@ class PathMessage(NamedTuple):
     """
 
     times: tuple[float, ...]
-    belief: Path
-    without: Mapping[int, Path]
+    belief: JointEstimate
+    without: Mapping[int, JointEstimate]
     seen: SeenPairs
     blocks: tuple[Place, ...]
 
@@ -167,7 +167,7 @@ class BlockBeliefPropagation(Filter):
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> PathState:
         """Return the state at time 0, at which errors of different nodes are independent."""
         places = node.blocks or (Place("plant", None, 0, len(mean)),)
-        own = Path(np.array(mean), np.array(cov))
+        own = JointEstimate(np.array(mean), np.array(cov))
         return PathState(own, (), {}, {}, (), 0.0, model, node.node, places)
 
     def predict(self, state: PathState, gap: float) -> PathState:
@@ -181,7 +181,7 @@ class BlockBeliefPropagation(Filter):
         step = scipy.linalg.block_diag(np.eye(len(x) - n), Phi)
         P = step @ P @ step.T
         P[-n:, -n:] += root @ root.T
-        return state._replace(own=Path(x, symmetric(P)))
+        return state._replace(own=JointEstimate(x, symmetric(P)))
 
     def update(self, state: PathState, reading: Reading) -> PathState:
         """Return the state after the readings of its own block; those of pairs are kept."""
@@ -189,7 +189,7 @@ class BlockBeliefPropagation(Filter):
         H = np.pad(reading.H, ((0, 0), (len(x) - state.n, 0)))
         x, P, _ = updated(x, P, Rows(reading.y, H, reading.R))
         seen = *state.seen, *((reading.time, pair) for pair in reading.pairs)
-        state = state._replace(own=Path(x, P), seen=seen, now=reading.time)
+        state = state._replace(own=JointEstimate(x, P), seen=seen, now=reading.time)
         return state.marked(reading.time, self.window) if reading.pairs else state
 
     def emit(self, state: PathState, exchange: Exchange) -> tuple[PathState, PathMessage]:
@@ -199,8 +199,8 @@ class BlockBeliefPropagation(Filter):
         marked = state.marked(_time(state, exchange), self.window)
         n = state.n
 
-        def past_of(belief: Path) -> Path:
-            return Path(belief.x[:-n], belief.P[:-n, :-n])
+        def past_of(belief: JointEstimate) -> JointEstimate:
+            return JointEstimate(belief.x[:-n], belief.P[:-n, :-n])
 
         without = {sender: past_of(marked.belief(without=sender)) for sender in marked.heard}
         message = PathMessage(
@@ -245,7 +245,7 @@ class BlockBeliefPropagation(Filter):
             return state
         x = state.own.x.copy()
         x[-state.n :] += offset
-        return state._replace(own=Path(x, state.own.P))
+        return state._replace(own=JointEstimate(x, state.own.P))
 
 
 def _time(state: PathState, exchange: Exchange) -> float:
@@ -253,7 +253,7 @@ def _time(state: PathState, exchange: Exchange) -> float:
     return state.now if exchange.slot >= 0 else exchange.time
 
 
-def evidence_of(state: PathState, message: PathMessage, belief: Path) -> Rows:
+def evidence_of(state: PathState, message: PathMessage, belief: JointEstimate) -> Rows:
     """Return what a message with the sender's ``belief`` says of the window of a node, as readings
     with unit noise: all readings of the pair at instants that both remember.
     """

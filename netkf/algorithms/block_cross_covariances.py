@@ -68,7 +68,7 @@ def copy_block(A: FloatArray, first: int, out: FloatArray) -> None:
 
 
 @kernel
-def multiply(T: FloatArray, A: FloatArray, turned: bool, out: FloatArray) -> None:
+def write_product(T: FloatArray, A: FloatArray, turned: bool, out: FloatArray) -> None:
     """Write ``T A``, or ``T A'`` if ``turned``, into another matrix ``out`` (r, c)."""
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
@@ -88,7 +88,7 @@ def move_factors(record: Any, h: int, run: Any, T: FloatArray, but: int, q: int)
 
 
 @kernel
-def tell(record: Any, h: int, run: Any, q: int) -> None:
+def send_estimates(record: Any, h: int, run: Any, q: int) -> None:
     """Let node ``h`` send what it knows now, without own readings to use."""
     n = len(run.size)
     set_own(record, h, n, q)
@@ -127,7 +127,7 @@ def predict(record: Any, h: int, run: Any) -> None:
         move_factors(record, h, run, record.T, -1, q)
     predict_estimate(run.model, run, record.xhat, record.root, h, h)
     for q in range(len(run.lanes)):
-        tell(record, h, run, q)
+        send_estimates(record, h, run, q)
 
 
 @kernel
@@ -209,7 +209,7 @@ def absorb(record: Any, h: int, run: Any) -> None:
                 met = True
         # Each pair has one turn: readings of pairs that are left are about others.
         if met:
-            tell(record, h, run, q)
+            send_estimates(record, h, run, q)
 
 
 @kernel
@@ -219,8 +219,8 @@ def meet(record: Any, h: int, run: Any, k: int, q: int) -> None:
     A, A_j, C, X, T, p = record.A, record.A_j, record.C, record.X, record.T, record.payload
     v = len(A_j)
     since = set_factors(record, m, w, q)
-    multiply(A, C, False, record.part)
-    multiply(record.part, A_j, True, X)
+    write_product(A, C, False, record.part)
+    write_product(record.part, A_j, True, X)
     # Own readings are used by both nodes alone, if nothing else is.
     seen = record.seen_now
     copy_matrix(seen, X)
@@ -228,15 +228,15 @@ def meet(record: Any, h: int, run: Any, k: int, q: int) -> None:
     if record.own[h, q] == 1 and use_rows(record, run, run.reading, 0, q):
         copy_block(f.stays, 0, T)
         copy_matrix(record.L, A)
-        multiply(T, record.L, False, A)
+        write_product(T, record.L, False, A)
         copy_matrix(record.part, seen)
-        multiply(T, record.part, False, seen)
+        write_product(T, record.part, False, seen)
     if p.own[m, q] == 1 and run.heard[k] >= 0 and use_rows(record, run, run.heard[k], n, q):
         copy_block(f.stays, n, record.T_j)
         copy_matrix(record.L_j, A_j)
-        multiply(record.T_j, record.L_j, False, A_j)
+        write_product(record.T_j, record.L_j, False, A_j)
         copy_matrix(record.part, seen)
-        multiply(record.part, record.T_j, True, seen)
+        write_product(record.part, record.T_j, True, seen)
     usable = invert(A, record.sizes[h], record.L, record.inverse)
     usable = invert(A_j, record.peer_sizes[w], record.L_j, record.inverse_j) and usable
     if usable:
@@ -253,10 +253,10 @@ def meet(record: Any, h: int, run: Any, k: int, q: int) -> None:
         for i in range(n):
             for j in range(v):
                 seen[i, j] = f.P[i, n + j]
-        multiply(record.inverse, seen, False, record.part)
-        multiply(record.part, record.inverse_j, True, C)
+        write_product(record.inverse, seen, False, record.part)
+        write_product(record.part, record.inverse_j, True, C)
     copy_matrix(record.L, A)
-    multiply(record.moved, record.L, False, A)
+    write_product(record.moved, record.L, False, A)
     keep_factors(record, w, q)
     now = run.now if run.slot < 0 else float(run.slot * record.steps + run.step)
     record.since[w, q], record.when[w, q] = since, now
@@ -420,7 +420,7 @@ def hear(record: Any, h: int, run: Any, k: int, q: int) -> None:
     copy_block(f.K, 0, record.T)
     move_factors(record, h, run, record.T, run.link[k], q)
     copy_matrix(record.L, record.moved)
-    multiply(record.T, record.L, False, record.moved)
+    write_product(record.T, record.L, False, record.moved)
     semidefinite_root(f.P, n)
     for i in range(n):
         for j in range(i + 1):

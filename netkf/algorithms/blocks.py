@@ -28,7 +28,7 @@ class BlockTables(Struct):
     size: IntArray
 
 
-def places_of(blocks: Sequence[Place], n: int) -> dict[Key, Place]:
+def blocks_by_key(blocks: Sequence[Place], n: int) -> dict[Key, Place]:
     """Return the blocks of a node of n states by name and owner; one of all states without any."""
     places = blocks or (Place("", None, 0, n),)
     return {place.key: place for place in places}
@@ -51,7 +51,7 @@ def block_tables(infos: Sequence[Any], models: Sequence[Any]) -> BlockTables:
     rows, theirs, first = [], [], np.full((len(infos), max(1, len(numbers))), -1)
     size = np.zeros(first.shape[1], dtype=np.int64)
     for h, (info, model) in enumerate(zip(infos, models, strict=True)):
-        own = places_of(info.blocks, len(model.information))
+        own = blocks_by_key(info.blocks, len(model.information))
         for place in info.blocks:
             number = numbers[place.key]
             first[h, number], size[number] = place.first, place.n
@@ -62,7 +62,7 @@ def block_tables(infos: Sequence[Any], models: Sequence[Any]) -> BlockTables:
             for place in heard:
                 number = numbers[place.key]
                 theirs[-1][number], size[number] = place.first, place.n
-            for key, place in places_of(heard, len(model.information)).items():
+            for key, place in blocks_by_key(heard, len(model.information)).items():
                 if key in own:
                     row[place.entries] = np.arange(place.n) + own[key].first
             rows.append(row)

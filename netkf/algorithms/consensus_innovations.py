@@ -47,7 +47,7 @@ CONVERGED = 1e-14
 """Relative change of covariances in a slot, of a few roundings, below which gains are constant."""
 
 
-class Gains(NamedTuple):
+class ConsensusGains(NamedTuple):
     """The gains of one node in one slot; or of N nodes in K slots, with W directions by receiver
     and sender.
 
@@ -115,14 +115,14 @@ class GainSequence:
         # All nodes start from the same mean: only x(0) - mean makes errors, as does w later.
         self._errors = stacked @ square_root(cov)
         self._driven = [stacked @ square_root(one) for one in Q]
-        self._gains: list[tuple[Gains, ...]] = []
+        self._gains: list[tuple[ConsensusGains, ...]] = []
         self._converged = False
 
-    def at(self, slot: int) -> tuple[Gains, ...]:
+    def at(self, slot: int) -> tuple[ConsensusGains, ...]:
         """Return the gains of each of N nodes in a ``slot``, counted from 1."""
         # Gains do not depend on readings: each slot is computed once.
         while len(self._gains) < slot and not self._converged:
-            self._gains.append(self._advance_slot())
+            self._gains.append(self._predict_errors())
             if len(self._gains) > 1 + max(self._changes, default=0):
                 roots = (np.stack([one.root for one in gains]) for gains in self._gains[-2:])
                 former, present = (S @ np.swapaxes(S, 1, 2) for S in roots)
@@ -130,7 +130,9 @@ class GainSequence:
                 self._converged = bool(change <= CONVERGED * np.abs(present).max())
         return self._gains[min(slot, len(self._gains)) - 1]
 
-    def table(self, first: int, count: int, places: Sequence[int]) -> tuple[np.ndarray, Gains]:
+    def table(
+        self, first: int, count: int, places: Sequence[int]
+    ) -> tuple[np.ndarray, ConsensusGains]:
         """Return the table rows (count,) of ``count`` slots from number ``first`` on, and the table
         of the gains of the nodes with the indices ``places``.
 
@@ -146,12 +148,14 @@ class GainSequence:
         K, N, n = len(slot_gains), len(places), self._n
         B, *other_gains = (
             np.concatenate([getattr(one, name).reshape(-1, n, n) for one in node_gains])
-            for name in Gains._fields
+            for name in ConsensusGains._fields
         )
-        table = Gains(B.reshape(K, -1, n, n), *(part.reshape(K, N, n, n) for part in other_gains))
+        table = ConsensusGains(
+            B.reshape(K, -1, n, n), *(part.reshape(K, N, n, n) for part in other_gains)
+        )
         return slots - slots[0], table
 
-    def _advance_slot(self) -> tuple[Gains, ...]:
+    def _predict_errors(self) -> tuple[ConsensusGains, ...]:
         """Advance ``_errors`` by a slot."""
         nodes = range(len(self._neighbours))
         x, y = self._errors.reshape(2, len(nodes), self._n, -1)
@@ -166,7 +170,7 @@ class GainSequence:
         # Only products of rows matter: QR reduces the inputs to as many as there are rows.
         self._errors = np.asarray(np.linalg.qr(self._errors.T, mode="r")).T
         roots = [lower_root(np.ascontiguousarray(self._state_error(i))) for i in nodes]
-        return tuple(Gains(B, M, K[i], roots[i]) for i, (B, M) in enumerate(gains))
+        return tuple(ConsensusGains(B, M, K[i], roots[i]) for i, (B, M) in enumerate(gains))
 
     def _state_error(self, i: int) -> FloatArray:
         """Return the error (n, inputs) of the xhat of node ``i``: a view to write to."""
@@ -271,7 +275,7 @@ def predict(record: Any, h: int, run: Any) -> None:
     """
     lanes, x, y, F, inverse = run.lanes, record.xhat, record.pseudo, run.model.F, record.inverse
     # y - G x, of which G^+ is a difference of states.
-    multiply(run, record.G, x, h, run.gains)
+    write_matvec(run, record.G, x, h, run.gains)
     for i in range(len(run.size)):
         store(lanes, run.gains, i, load(lanes, y, h, i) - load(lanes, run.gains, i))
     for i in range(len(run.size)):
@@ -285,7 +289,7 @@ def predict(record: Any, h: int, run: Any) -> None:
 
 
 @kernel
-def multiply(run: Any, matrix: FloatArray, x: FloatArray, k: int, out: FloatArray) -> None:
+def write_matvec(run: Any, matrix: FloatArray, x: FloatArray, k: int, out: FloatArray) -> None:
     """Write the product of a ``matrix`` (n, n) and ``x[k]`` into ``out`` (n, L)."""
     for i in range(len(run.size)):
         total = spread(run.lanes, 0.0)

@@ -11,7 +11,12 @@ from typing import Any
 import numpy as np
 
 from netkf.algorithms.filter import Filter, NodeInfo
-from netkf.algorithms.kernels.intersection import finish_lanes, invert_lanes, merge_lanes, whiten
+from netkf.algorithms.kernels.intersection import (
+    finish_lanes,
+    invert_lanes,
+    merge_lanes,
+    write_information_root,
+)
 from netkf.algorithms.kernels.neighbours import received_weight
 from netkf.algorithms.kernels.run import carry, copy_estimate
 from netkf.algorithms.records import Kernels, Record
@@ -55,7 +60,7 @@ def absorb(record: Any, h: int, run: Any) -> None:
     total = local_lanes_pair(run.size, lanes, run.total)
     whitened = local_lanes_pair(run.size, lanes, run.whitened)
     invert_lanes(lanes, run.size, record.inverse, h, root, h)
-    whiten(lanes, run.size, total, own, record.inverse, x, h, x, h)
+    write_information_root(lanes, run.size, total, own, record.inverse, x, h, x, h)
     for k in range(run.count):
         # A weight of 0 adds no information.
         if run.message_weight[k] > 0.0:
@@ -68,7 +73,9 @@ def absorb(record: Any, h: int, run: Any) -> None:
                 invert_lanes(lanes, run.size, payload.inverse, m, payload.root, m)
             arrived = load_flags(lanes, run.arrived, k)
             weight = select(arrived, run.message_weight[k] / divisor, 0.0)
-            whiten(lanes, run.size, whitened, weight, payload.inverse, payload.xhat, m, x, h)
+            write_information_root(
+                lanes, run.size, whitened, weight, payload.inverse, payload.xhat, m, x, h
+            )
             merge_lanes(lanes, run.size, total, whitened)
     finish_lanes(lanes, run.size, root, x, h, x, total, whitened, own == 1.0)
 

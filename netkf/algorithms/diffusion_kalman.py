@@ -50,7 +50,7 @@ def absorb(record: Any, h: int, run: Any) -> None:
         store(lanes, x, h, i, own + total)
 
 
-def message_size(n: int, rows: int, phase: int) -> int:
+def diffusion_message_size(n: int, rows: int, phase: int) -> int:
     """Return the numbers in a message: in the exchange of readings y, H and R of ``rows`` rows, in
     that of estimates psi with n states.
     """
@@ -78,7 +78,7 @@ class DiffusionKalman(WeightedFilter):
     analysis = Analysis(
         paper="diffusion_kalman",
         tells_estimates=lambda phase: phase != READINGS,
-        payload_numbers=message_size,
+        payload_numbers=diffusion_message_size,
     )
     timing = Timing(
         schedule=("predict", "sense", "exchange", "exchange"),

@@ -18,7 +18,12 @@ import numpy as np
 
 from netkf.algorithms.filter import Filter, NodeInfo
 from netkf.algorithms.information_consensus import INFORMATION, Hcmci
-from netkf.algorithms.kernels.intersection import finish_lanes, invert_lanes, merge_lanes, whiten
+from netkf.algorithms.kernels.intersection import (
+    finish_lanes,
+    invert_lanes,
+    merge_lanes,
+    write_information_root,
+)
 from netkf.algorithms.kernels.run import copy_estimate, predict_copy, predict_estimate, shift_vector
 from netkf.algorithms.kernels.triggers import is_near
 from netkf.algorithms.records import Kernels, Record
@@ -86,14 +91,14 @@ def absorb(record: Any, h: int, run: Any) -> None:
         return
     own = select(copied < 1.0, 1.0 - copied, 0.0)
     invert_lanes(lanes, run.size, record.inverse, h, record.root, h)
-    whiten(lanes, run.size, run.total, own, record.inverse, x, h, x, h)
+    write_information_root(lanes, run.size, run.total, own, record.inverse, x, h, x, h)
     for w in range(first[h], first[h + 1]):
         if any_lane(load_flags(lanes, record.has_copy, w)):
             # The covariance of a silent neighbour's copy is enlarged by 1 / share.
             share = select(load_flags(lanes, record.fresh, w), 1.0, record.share)
             invert_lanes(lanes, run.size, inverse, w, copy_root, w)
             weight = share * load(lanes, record.weight, w)
-            whiten(lanes, run.size, run.whitened, weight, inverse, copy_x, w, x, h)
+            write_information_root(lanes, run.size, run.whitened, weight, inverse, copy_x, w, x, h)
             merge_lanes(lanes, run.size, run.total, run.whitened)
     finish_lanes(lanes, run.size, record.root, x, h, x, run.total, run.whitened, copied == 0.0)
 

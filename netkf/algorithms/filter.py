@@ -302,7 +302,7 @@ class Filter(Component):
         plant and sensors; ``node`` is what the node knows about itself and the network.
         """
         if self.kernels is not None:
-            return single.begin(self, model, mean, cov, node)
+            return single.begin_node(self, model, mean, cov, node)
         return State(mean, first_root(cov), model)
 
     def predict(self, state: Any, gap: float) -> Any:

@@ -29,8 +29,13 @@ import numpy as np
 
 from netkf.algorithms.diffusion import DiffusionFilter, diffusion_filter_record
 from netkf.algorithms.filter import Filter, NodeInfo
-from netkf.algorithms.kernels.information import add_reading_pair, copy_part, weigh_part
-from netkf.algorithms.kernels.intersection import finish_lanes, invert_lanes, merge_lanes, whiten
+from netkf.algorithms.kernels.information import add_reading_pair, copy_information_root, weigh_part
+from netkf.algorithms.kernels.intersection import (
+    finish_lanes,
+    invert_lanes,
+    merge_lanes,
+    write_information_root,
+)
 from netkf.algorithms.kernels.neighbours import received_weight
 from netkf.algorithms.models import SlotModel
 from netkf.algorithms.records import Kernels, Record, triangle_numbers
@@ -70,10 +75,10 @@ def begin_pairs(record: Any, h: int, run: Any) -> None:
     lanes, shares, x = run.lanes, record.shares, record.xhat
     invert_lanes(lanes, run.size, record.inverse, h, record.root, h)
     for k in range(len(shares)):
-        whiten(lanes, run.size, run.total, shares[k, 0], record.inverse, x, h, x, h)
+        write_information_root(lanes, run.size, run.total, shares[k, 0], record.inverse, x, h, x, h)
         if shares[k, 1] > 0.0:
             add_reading_pair(run, run.total, shares[k, 1], run.reading, x, h, run.whitened)
-        copy_part(lanes, run.total, record.parts[h, k])
+        copy_information_root(lanes, run.total, record.parts[h, k])
 
 
 @kernel
@@ -82,7 +87,7 @@ def emit_pairs(record: Any, h: int, m: int, run: Any) -> None:
     for i in range(len(run.size)):
         store(run.lanes, record.payload.xhat, m, i, load(run.lanes, record.xhat, h, i))
     for k in range(len(record.shares)):
-        copy_part(run.lanes, record.parts[h, k], record.payload.parts[m, k])
+        copy_information_root(run.lanes, record.parts[h, k], record.payload.parts[m, k])
 
 
 @kernel
@@ -106,11 +111,11 @@ def mix_pairs(record: Any, h: int, run: Any) -> None:
                     lanes, work, weight, payload.parts, run.message[k], p, payload.xhat, x, h
                 )
                 merge_lanes(lanes, run.size, total, work)
-        copy_part(lanes, total, parts[h, p])
+        copy_information_root(lanes, total, parts[h, p])
     if run.step == record.steps - 1:
         # The information of the estimate is the sum of the prediction's and that of the pairs.
         counts, K = record.counts, len(record.shares)
-        whiten(lanes, run.size, total, counts[K], record.inverse, x, h, x, h)
+        write_information_root(lanes, run.size, total, counts[K], record.inverse, x, h, x, h)
         for p in range(K):
             weigh_part(lanes, work, spread(lanes, counts[p]), parts, h, p, x, x, h)
             merge_lanes(lanes, run.size, total, work)

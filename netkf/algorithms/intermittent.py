@@ -111,7 +111,7 @@ def use_and_remember(record: Any, h: int, run: Any, r: int) -> None:
     use_reading(run, record.xhat, record.root, h, r, True)
     if record.lag <= 0.0:
         return
-    forget(record, h, run)
+    forget_events(record, h, run)
     e = record.kept[h, 0]
     record.past_time[h, e, 0], record.past_moves[h, e, 0] = record.time[h, 0], record.moves[h, 0]
     store_reading(record, h, run, e, r)
@@ -127,7 +127,7 @@ def use_late(record: Any, h: int, run: Any, k: int) -> None:
     r = run.heard[k]
     if run.rows[r] == 0:
         return
-    forget(record, h, run)
+    forget_events(record, h, run)
     time, moves = record.time[h, 0] - run.age[k], record.payload.moves[run.message[k], 0]
     last = record.kept[h, 0]
     # It was taken before this node began again, which is more than a rounding of its age.
@@ -225,7 +225,7 @@ def copy_event(record: Any, h: int, run: Any, to: int, e: int) -> None:
 
 
 @kernel
-def forget(record: Any, h: int, run: Any) -> None:
+def forget_events(record: Any, h: int, run: Any) -> None:
     """Forget the events of node ``h`` that no late reading can reach any more, all but the last of
     them; once in each interval of length ``lag``, since those that stay are moved.
     """

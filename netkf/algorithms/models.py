@@ -424,12 +424,12 @@ class RateModel(FlowModel):
         )
 
     @cached_property
-    def _kept(self) -> RateTables:
+    def _rate_tables(self) -> RateTables:
         return self.tables()
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what can be pickled: the addresses in tables mean nothing elsewhere."""
-        return {name: value for name, value in self.__dict__.items() if name != "_kept"}
+        return {name: value for name, value in self.__dict__.items() if name != "_rate_tables"}
 
     def raise_error(self) -> None:
         """Raise the error of a user's f or Jacobian, if a call has failed."""
@@ -441,7 +441,7 @@ class RateModel(FlowModel):
     ) -> tuple[FloatArray, FloatArray]:
         n = len(xhat)
         x, S = np.array(xhat).reshape(1, n, 1), np.array(root).reshape(1, n, n, 1)
-        move_by_rate(self._kept, x, S, 0, self.now, gap)
+        move_by_rate(self._rate_tables, x, S, 0, self.now, gap)
         self.raise_error()
         return x.reshape(n), S.reshape(n, n)
 

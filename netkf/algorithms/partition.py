@@ -93,7 +93,7 @@ def set_gap(record: Any, h: int, run: Any) -> None:
 
 
 @kernel
-def are_alike(A: FloatArray, k: int) -> bool:
+def equal_in_lanes(A: FloatArray, k: int) -> bool:
     """Return True if the matrix ``A[k]`` (n, n, L) is the same in all lanes."""
     for i in range(A.shape[1]):
         for j in range(A.shape[2]):
@@ -203,10 +203,10 @@ def predict(record: Any, h: int, run: Any) -> None:
     depend on how often somebody looks.
     """
     set_gap(record, h, run)
-    T, L, same = record.T, len(run.lanes), are_alike(record.bounds, h)
+    T, L, same = record.T, len(run.lanes), equal_in_lanes(record.bounds, h)
     move_vector(T, record.x, h, record.row)
     move_vector(T, record.start_x, h, record.row)
-    same = same and are_alike(record.Phi, h) and are_alike(record.Q, h)
+    same = same and equal_in_lanes(record.Phi, h) and equal_in_lanes(record.Q, h)
     # Runs in which the same has happened have the same covariances, which take most of the time.
     step = L if same else 1
     for q in range(0, L, step):
@@ -309,7 +309,7 @@ def take_group(record: Any, h: int, g: int) -> int:
 
 
 @kernel
-def use(record: Any, count: int, q: int, end: int) -> None:
+def update_group(record: Any, count: int, q: int, end: int) -> None:
     """Update the group taken with ``count`` rows, whose errors with the covariance ``heard`` may
     correlate with that of the group.
     """
@@ -344,7 +344,7 @@ def update(record: Any, h: int, run: Any) -> None:
     r, group, L = run.reading, record.groups.number[h], len(run.lanes)
     place, matrix = run.first_y + r, run.first_H + run.matrix[r]
     # run.H may be that of all runs.
-    step = L if are_alike(record.root, h) and are_alike(run.H, matrix) else 1
+    step = L if equal_in_lanes(record.root, h) and equal_in_lanes(run.H, matrix) else 1
     for q in range(0, L, step):
         end, says = q + step, False
         for g in range(record.groups.count[h]):
@@ -358,8 +358,8 @@ def update(record: Any, h: int, run: Any) -> None:
                     add_row(record, run, (place, matrix, c), (q, end), group, count)
                     count += 1
             if count > 0:
-                use_rows(record, h, g, count)
-                use(record, count, q, end)
+                update_own_blocks(record, h, g, count)
+                update_group(record, count, q, end)
         if says:
             begin_anew(record, h, q, end)
 
@@ -396,7 +396,7 @@ def add_row(
 
 
 @kernel
-def use_rows(record: Any, h: int, g: int, count: int) -> None:
+def update_own_blocks(record: Any, h: int, g: int, count: int) -> None:
     """Let the own blocks be updated with ``count`` white rows that depend on group ``g``, too."""
     f, others, n = record.fusion, record.others, len(record.T)
     for c in range(count):
@@ -412,11 +412,11 @@ def use_rows(record: Any, h: int, g: int, count: int) -> None:
 @kernel
 def absorb(record: Any, h: int, run: Any) -> None:
     """Use the messages of this instant one after the other, by sender."""
-    L, same = len(run.lanes), are_alike(record.root, h)
+    L, same = len(run.lanes), equal_in_lanes(record.root, h)
     for k in range(run.count):
         for q in range(1, L):
             same = same and run.arrived[k, q] == run.arrived[k, 0]
-        same = same and are_alike(record.payload.root, run.message[k])
+        same = same and equal_in_lanes(record.payload.root, run.message[k])
     step = L if same else 1
     for q in range(0, L, step):
         says = False
@@ -441,7 +441,7 @@ def hear(record: Any, h: int, run: Any, k: int, q: int, end: int) -> None:
     told, place = record.told.number[w], (m, q, end)
     read_estimate(payload.xhat, payload.root, place, record.theirs[w], told, (x, P))
     if run.age[k] > 0.0:
-        predict_message(record, h, run, k)
+        predict_sender(record, h, run, k)
     f, at, common = record.fusion, record.at, record.common
     for g in range(record.groups.count[h]):
         size, count, heard = take_group(record, h, g), 0, 0.0
@@ -458,13 +458,13 @@ def hear(record: Any, h: int, run: Any, k: int, q: int, end: int) -> None:
             for d in range(count):
                 f.heard[c, d], f.noise[c, d] = P[common[c], common[d]], 0.0
         if count > 0:
-            use(record, count, q, end)
+            update_group(record, count, q, end)
         if count == size:
-            forget(record, size, heard, q, end)
+            replace_group(record, size, heard, q, end)
 
 
 @kernel
-def forget(record: Any, size: int, heard: float, q: int, end: int) -> None:
+def replace_group(record: Any, size: int, heard: float, q: int, end: int) -> None:
     """Replace what is known of the group taken by what was told of all of it, with the trace
     ``heard``, if that is less.
     """
@@ -479,7 +479,7 @@ def forget(record: Any, size: int, heard: float, q: int, end: int) -> None:
 
 
 @kernel
-def predict_message(record: Any, h: int, run: Any, k: int) -> None:
+def predict_sender(record: Any, h: int, run: Any, k: int) -> None:
     """Predict what message ``k`` tells to now, with what its sender has of other blocks."""
     x, P, gap, n = record.heard_x, record.heard_P, run.gap, len(record.T)
     run.gap = run.age[k]

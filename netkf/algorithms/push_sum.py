@@ -411,7 +411,7 @@ def shift_payload(record: Any, m: int, run: Any) -> None:
     shift_vector(run, record.payload.xhat, m)
 
 
-def message_size(n: int, _rows: int, phase: int) -> int:
+def push_sum_message_size(n: int, _rows: int, phase: int) -> int:
     """Return the numbers in a message about n states: mass w, n~, C~, or an estimate z; under
     clocks (``phase`` -1) a weight, an information P^-1 and P^-1 xhat, which for a plant with modes
     of different rates of decay is in n more numbers for each further rate.
@@ -426,7 +426,7 @@ def has_frozen(state: Any) -> bool:
     return hasattr(state, "stopped") and bool(state.stopped < NEVER_STOPPED)
 
 
-def masses(state: Any) -> Mapping[str, float | Sequence[float]]:
+def mass_terms(state: Any) -> Mapping[str, float | Sequence[float]]:
     """Return the weight w and the number n~ of a node by name, whose sums over all nodes are 1 and
     N; with running sums each as a list of terms, which adds to the node's mass the totals that it
     offered to its neighbours and subtracts those it heard: mass under way counts.
@@ -560,8 +560,8 @@ class PushSum(Filter):
     analysis = Analysis(
         paper="push_sum",
         P_by_design=("", "smaller"),
-        payload_numbers=message_size,
-        conserved=masses,
+        payload_numbers=push_sum_message_size,
+        conserved=mass_terms,
         stopped=has_frozen,
     )
 

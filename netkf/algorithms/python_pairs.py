@@ -9,7 +9,7 @@ import numpy as np
 
 from netkf.algorithms.blocks import block_numbers
 from netkf.algorithms.kernels.nonlinear_rows import linear_rows
-from netkf.algorithms.kernels.pairs import IN_PYTHON, Pairs, pairs_of
+from netkf.algorithms.kernels.pairs import IN_PYTHON, Pairs, empty_pairs
 from netkf.linalg.arrays import FloatArray, enlarged
 from netkf.linalg.vector_functions import VectorFunction
 
@@ -38,7 +38,7 @@ class PythonPairs:
     def _room(self, count: int, p: int, first: Sequence[int]) -> Pairs:
         rows = linear_rows(count, p, np.full((1, self._n), -1))
         rows.matrix = np.zeros((p, 1 + self._n))
-        return pairs_of(rows, self._own, np.array(first, dtype=np.int64))
+        return empty_pairs(rows, self._own, np.array(first, dtype=np.int64))
 
     def take(self, readings: Sequence[Any], senders: Sequence[Any]) -> tuple[Pairs, list[Any]]:
         """Return the pairs of ``readings`` (``single.Whitened``), brought by the payloads

@@ -161,7 +161,7 @@ class Kernels:
     shift: Any = standard.shift
     shift_payload: Any = standard.shift_payload
     observe: Any = standard.observe
-    interval: Any = standard.interval
+    interval: Any = standard.max_increment_interval
     decides: bool = False
     sends_readings: bool = False
     remembers: bool = False

@@ -21,7 +21,7 @@ from netkf.algorithms.kernels.root_flow import stack_tables
 from netkf.algorithms.kernels.run import (
     ClockRun,
     SingleSlotRun,
-    SlotTables,
+    SlotModelArrays,
     clock_tables,
     size_of,
 )
@@ -37,7 +37,7 @@ from netkf.algorithms.models import (
 from netkf.algorithms.python_pairs import PythonPairs
 from netkf.algorithms.records import Kernels, Records, double_past, make_records
 from netkf.linalg.addresses import call_kernel
-from netkf.linalg.arrays import FloatArray, IntArray, address_of
+from netkf.linalg.arrays import FloatArray, IntArray, array_address
 from netkf.linalg.lanes import ONE
 
 
@@ -146,12 +146,12 @@ class NodeState:
         new: Any = object.__new__(cls)
         memory = record.memory.copy()
         object.__setattr__(new, "memory", memory)
-        object.__setattr__(new, "address", address_of(memory))
+        object.__setattr__(new, "address", array_address(memory))
         for name, value in record.__dict__.items():
             if name in self.changing:
                 array = value.copy()
                 new.__dict__[name] = array
-                memory[cls.struct_offsets[name]] = address_of(array)
+                memory[cls.struct_offsets[name]] = array_address(array)
             elif name not in ("memory", "address"):
                 new.__dict__[name] = value
         while self.run.past and int(new.kept[0, 0]) + events > new.room:
@@ -293,7 +293,7 @@ def _tables_of(model: Any) -> Any:
         return model.tables()
     if not isinstance(model, FlowModel):
         F, root_Q = (np.array(part, order="C") for part in (model.F, model.root_Q))
-        return SlotTables(F=F, root_Q=root_Q)
+        return SlotModelArrays(F=F, root_Q=root_Q)
     # A node that follows changes has them in its tables; other nodes of one model share theirs.
     make = _clock_tables if isinstance(model, ChangingFlowModel) else _shared_clock_tables
     return make(model)
@@ -312,7 +312,9 @@ def _clock_tables(model: FlowModel) -> Any:
 _shared_clock_tables = lru_cache(maxsize=8)(_clock_tables)
 
 
-def begin(filtering: Any, model: Any, mean: FloatArray, cov: FloatArray, info: Any) -> NodeState:
+def begin_node(
+    filtering: Any, model: Any, mean: FloatArray, cov: FloatArray, info: Any
+) -> NodeState:
     """Return the state of a node at time 0, with estimate ``mean`` (n,) and ``cov`` (n, n)."""
     degree = max(1, info.degree, len(info.senders))
     start = np.asarray(mean, dtype=np.float64), first_root(cov)
@@ -328,7 +330,7 @@ def begin(filtering: Any, model: Any, mean: FloatArray, cov: FloatArray, info: A
 def _restored(filtering: Any, model: Any, info: Any, values: dict[str, Any], reading: Any) -> Any:
     """Return a state that was pickled."""
     n = values["xhat"].shape[1]
-    state = begin(filtering, model, np.zeros(n), np.eye(n), info)
+    state = begin_node(filtering, model, np.zeros(n), np.eye(n), info)
     for name, array in values.items():
         setattr(state.record, name, array)
     if state.run.past:

@@ -57,7 +57,7 @@ def _information_condition(scenario: Any) -> float:
     n = scenario.plant.n
     # Such filters estimate one state at all nodes.
     G = sum((H.T @ np.linalg.solve(R, H) for H, R in pairs), np.zeros((n, n)))
-    G = scenario.seen_part(0, G)
+    G = scenario.estimated_part(0, G)
     F, Q = scenario.estimated_pieces[0][0]
     covs = {cov.tobytes(): cov for _, cov in map(scenario.initial_estimate, scenario.nodes)}
     largest = 1.0

@@ -24,7 +24,7 @@ from netkf.checks.laws import (
 from netkf.checks.mode_sequences import (
     FAR_START,
     MIN_CHAINS,
-    SwitchedSamples,
+    SwitchedReference,
     check_bounded,
     check_initial_condition,
     check_law,
@@ -161,7 +161,7 @@ class Chains(NamedTuple):
 
 
 @dataclass(frozen=True)
-class GossipSamples(SwitchedSamples):
+class GossipSamples(SwitchedReference):
     """Adds samples of the switched chain."""
 
     @cached_property

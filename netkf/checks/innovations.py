@@ -134,7 +134,7 @@ class ExpectedIncrements:
 
 
 @dataclass(frozen=True, eq=False)
-class Recorder(Filter):
+class RecordingFilter(Filter):
     """The filter ``inner``, which appends to ``recorded``; ``expected`` is by id of its models."""
 
     inner: Filter
@@ -237,7 +237,7 @@ def compute_innovations(run: Run, max_events: int = MAX_EVENTS) -> Innovations:
     scenario: Scenario = run.scenario
     if len(run.log) > max_events:
         raise NetkfError(f"a run of more than {max_events:,} events is not replayed")
-    recorder = Recorder(scenario.filter.algorithm, [], {})
+    recorder = RecordingFilter(scenario.filter.algorithm, [], {})
     filtering = dataclasses.replace(scenario.filter, algorithm=recorder)
     replay = simulate(with_filter(scenario, filtering), run.seed, run.replica, "simpy")
     # Without a trace there are no events to compare.

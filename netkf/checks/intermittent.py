@@ -26,7 +26,7 @@ from netkf.checks.mode_sequences import (
     FAR_START,
     MIN_CHAINS,
     ModeTable,
-    SwitchedSamples,
+    SwitchedReference,
     check_bounded,
     check_initial_condition,
     check_law,
@@ -183,7 +183,7 @@ class ArrivalSamples(NamedTuple):
 
 
 @dataclass(frozen=True)
-class IntermittentSamples(SwitchedSamples):
+class IntermittentSamples(SwitchedReference):
     """Adds simulated covariances with independent arrivals, paper R (12)."""
 
     def draw_reference(self) -> ArrivalSamples:

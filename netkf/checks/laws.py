@@ -10,7 +10,7 @@ import numpy as np
 from netkf.checks.evidence import Assumption, Finding, find_unknown
 from netkf.checks.rounding import EPS, OPERATIONS
 from netkf.checks.statistics import law_distance, law_excess
-from netkf.laws.intervals import Comparison, Interval, deviation_interval, scale_interval
+from netkf.laws.intervals import Interval, LawComparison, deviation_interval, scale_interval
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 
@@ -68,7 +68,7 @@ def find_largest(
     return finding._replace(seen=chosen.seen, expected=chosen.expected, forecast=forecast)
 
 
-def find(comparison: Comparison, tolerance: float) -> Finding:
+def find(comparison: LawComparison, tolerance: float) -> Finding:
     """Return the finding of a ``comparison`` with stated laws: the most significant distance."""
     distances, text, overall = comparison
     if not distances:

@@ -87,7 +87,7 @@ class Reference(Protocol):
 
 
 @dataclass(frozen=True)
-class SwitchedSamples(RunSamples):
+class SwitchedReference(RunSamples):
     """Adds simulated covariances with whose laws those of P in the runs are compared; derived
     classes draw them.
     """
@@ -96,7 +96,7 @@ class SwitchedSamples(RunSamples):
     def reference(self) -> Any:
         """The :class:`Reference` of all looks at the runs of a seed."""
         cls: Any = type(self)
-        return _kept_reference(cls, self.scenario, self.seed)
+        return _cached_reference(cls, self.scenario, self.seed)
 
     def draw_reference(self) -> Reference:
         """Return the covariances at the checked slots; it needs no runs."""
@@ -122,11 +122,11 @@ class SwitchedSamples(RunSamples):
 
 
 @lru_cache(maxsize=1)
-def _kept_reference(samples: type[SwitchedSamples], scenario: Scenario, seed: int) -> Reference:
+def _cached_reference(samples: type[SwitchedReference], scenario: Scenario, seed: int) -> Reference:
     return samples(scenario, None, seed).draw_reference()
 
 
-def check_law(samples: SwitchedSamples, level: float) -> Finding:
+def check_law(samples: SwitchedReference, level: float) -> Finding:
     """Compare the law of P at each node and slot with that of the reference there."""
     pairs = [
         Pair(f"slot {slot}, node {node}", samples.runs.P[:, k, i], samples.reference.at(k, i))
@@ -136,7 +136,7 @@ def check_law(samples: SwitchedSamples, level: float) -> Finding:
     return compare_laws(pairs, level, samples.first_trace)
 
 
-def check_bounded(samples: SwitchedSamples, level: float) -> Finding:
+def check_bounded(samples: SwitchedReference, level: float) -> Finding:
     """Test that P stays stochastically bounded."""
     P, last = samples.runs.P, len(check_slots(samples.scenario)) - 1
     nodes = list(enumerate(samples.nodes))
@@ -146,7 +146,7 @@ def check_bounded(samples: SwitchedSamples, level: float) -> Finding:
     return samples.with_horizon(finding, lambda reference: reference.growth())
 
 
-def check_initial_condition(samples: SwitchedSamples, level: float) -> Finding:
+def check_initial_condition(samples: SwitchedReference, level: float) -> Finding:
     """Compare the law of P at the end with that from a far larger start."""
     reference, last = samples.reference, len(check_slots(samples.scenario)) - 1
     pairs = [

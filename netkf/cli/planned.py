@@ -112,7 +112,7 @@ def merge_study(plan: Plan, options: argparse.Namespace) -> int:
     """Finish the study as its command would; return its exit status, 1 if runs are missing."""
     from netkf.ensembles.parts import Worker
     from netkf.ensembles.planned_study import PlannedStudy
-    from netkf.ensembles.plans import require_alike
+    from netkf.ensembles.plans import require_equal_installations
 
     study_options = _study_options(plan, options)
     rounds = has_rounds(study_options)
@@ -122,7 +122,7 @@ def merge_study(plan: Plan, options: argparse.Namespace) -> int:
     if any(gap.missing for gap in gaps):
         print_missing(plan, gaps, rounds)
         return FAILED
-    if len(require_alike(study.installations, plan.directory, options.mixed)) > 1:
+    if len(require_equal_installations(study.installations, plan.directory, options.mixed)) > 1:
         print_notes(["results are of machines of different kinds: last digits may be others"])
     status = _merge_again(study_options, plan)
     if status is not None:

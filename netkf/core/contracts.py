@@ -57,7 +57,7 @@ def is_netkf_class(cls: type) -> bool:
     return cls.__module__.partition(".")[0] == "netkf"
 
 
-def place_of(code: CodeType, line: int | None = None) -> str:
+def source_line(code: CodeType, line: int | None = None) -> str:
     """Return "file, line n" of a function's ``code``, or of a ``line`` in it: the path is relative
     where the file is below the current folder.
     """
@@ -69,13 +69,13 @@ def place_of(code: CodeType, line: int | None = None) -> str:
     return f"{file if relative.startswith('..') else relative}, line {line}"
 
 
-def place_of_error(error: BaseException) -> str:
+def error_line(error: BaseException) -> str:
     """Return "file, line n" of the deepest call in a user's file that led to an error, "" if there
     is none: neither netkf's files count, nor those of installed packages and of Python.
     """
     ours, python = str(Path(__file__).parents[1]), os.path.dirname(os.__file__)
     places = [
-        place_of(frame.f_code, line)
+        source_line(frame.f_code, line)
         for frame, line in traceback.walk_tb(error.__traceback__)
         if not frame.f_code.co_filename.startswith(("<", ours, python))
         and "site-packages" not in frame.f_code.co_filename
@@ -85,7 +85,7 @@ def place_of_error(error: BaseException) -> str:
 
 def describe_method(cls: type, function: FunctionType) -> str:
     """Return "Class.method (file, line n)"."""
-    return f"{cls.__name__}.{function.__name__} ({place_of(function.__code__)})"
+    return f"{cls.__name__}.{function.__name__} ({source_line(function.__code__)})"
 
 
 def hold_to_contract(cls: type) -> None:

@@ -229,7 +229,7 @@ class _Entries:
             return source.node_ids[name]
         if not name and not may_miss:
             raise self._refusal(column, "must be the id or the name of a node", "correct the entry")
-        if not name or is_number(name):
+        if not name or is_number_text(name):
             number = self.number(column, may_miss)
             if number < 0.0:
                 raise self._refusal(column, "must be an integer from 0 to 2^53", "correct it")
@@ -284,26 +284,26 @@ def _require_columns(source: SourceFile, sheet: _Sheet, required: tuple[str, ...
         return
     rule = f"{source.name} must have the columns {', '.join(required)}"
     alike = [name for name in header if name.casefold() == missing[0].casefold()]
-    named = [line for line, text in sheet.comments.items() if missing[0] in _words(text)]
+    named = [line for line, text in sheet.comments.items() if missing[0] in _split_text(text)]
     remedy = f"add the column {missing[0]}"
     if named:
         remedy = f"remove the # before the names of the columns in line {named[-1]}"
     elif alike:
         remedy = f"write {missing[0]} for {alike[0]}"
-    elif len(header) == 1 and missing[0] in _words(header[0]):
+    elif len(header) == 1 and missing[0] in _split_text(header[0]):
         remedy = "separate the columns by commas, semicolons or tabs"
-    elif all(map(is_number, header)):
+    elif all(map(is_number_text, header)):
         remedy = "write the names of the columns in the first line"
     raise ScenarioError("path", rule, header, remedy)
 
 
-def _words(text: str) -> list[str]:
+def _split_text(text: str) -> list[str]:
     for sign in "#,;|:":
         text = text.replace(sign, " ")
     return text.split()
 
 
-def is_number(text: str) -> bool:
+def is_number_text(text: str) -> bool:
     """Return True for a number, with a decimal point or comma."""
     try:
         float(text.replace(",", "."))

@@ -202,7 +202,7 @@ def merge_plan(
     missing = list(missing_ranges(writer.known, range(plan.identity.runs)))
     if missing:
         return missing
-    machines = require_alike(writer.blocks.installations, plan.directory, mixed)
+    machines = require_equal_installations(writer.blocks.installations, plan.directory, mixed)
     if note is not None and machines != [machine()]:
         note("runs were simulated on another kind of machine than this: bounds of theory are of it")
     with LocalPool() as pool:
@@ -216,7 +216,7 @@ def merge_plan(
     return finished
 
 
-def require_alike(
+def require_equal_installations(
     installations: Sequence[dict[str, Any]], directory: Path, mixed: bool
 ) -> list[dict[str, Any]]:
     """Return the machines of the ``installations`` that made the results in a directory; raises

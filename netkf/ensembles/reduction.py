@@ -40,7 +40,7 @@ class Reduced(NamedTuple):
     spans: np.ndarray
 
 
-class Samples(Struct):
+class ReducedSamples(Struct):
     """Samples of R runs for kernels, and what they become; C = 2 u + 1 columns of a filter.
 
     P, error, nees : (R, T F, n, n), (R, T F, n), (R, T F)
@@ -90,7 +90,7 @@ def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
     bounds = np.array([0, *(piece.stop for piece in pieces)])
     columns, depth = n * (n + 1) + 1, int(np.diff(bounds).max()).bit_length() + 1
     at_once = min(count, max(1, NUMBERS_AT_ONCE // (filters * columns)))
-    samples = Samples(
+    samples = ReducedSamples(
         P=flat[1],
         error=flat[0],
         nees=nees_of_runs(*of_nees, kept * filters),
@@ -114,7 +114,7 @@ def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
 
 
 def _averaged_spans(batch: RunBatch, kept: np.ndarray, rounding_from: FloatArray) -> np.ndarray:
-    """Return ``Samples.spans`` (R, 3), by the rule of ``runs.summary.select_averaged_samples``."""
+    """Return ``ReducedSamples.spans`` (R, 3), see ``runs.summary.select_averaged_samples``."""
     start = int(np.searchsorted(batch.times, 0.0, side="right"))
     begin = np.where(start < kept, start, 0)
     errors_end = np.clip(np.searchsorted(batch.times, rounding_from), begin, kept)
@@ -124,7 +124,7 @@ def _averaged_spans(batch: RunBatch, kept: np.ndarray, rounding_from: FloatArray
 
 
 @kernel
-def reduce_samples(size: Size, s: Samples, bounds: np.ndarray) -> None:
+def reduce_samples(size: Size, s: ReducedSamples, bounds: np.ndarray) -> None:
     """Fill ``s.averages`` with sums over samples, and the moments of K pieces of the runs, of which
     piece k has the runs ``bounds[k]`` to ``bounds[k + 1] - 1``; ``size`` has the length n.
     """
@@ -149,7 +149,7 @@ def reduce_samples(size: Size, s: Samples, bounds: np.ndarray) -> None:
 
 
 @kernel
-def fill_node(size: Size, s: Samples, r: int, t: int, count: int, node: int) -> None:
+def fill_node(size: Size, s: ReducedSamples, r: int, t: int, count: int, node: int) -> None:
     """Make ``count`` samples from number ``t`` on of run ``r`` the moments of a ``node``, zero
     where the run lacks them.
     """
@@ -176,7 +176,7 @@ def fill_node(size: Size, s: Samples, r: int, t: int, count: int, node: int) -> 
 
 
 @kernel
-def add_sums(size: Size, s: Samples, r: int, t: int, count: int) -> None:
+def add_sums(size: Size, s: ReducedSamples, r: int, t: int, count: int) -> None:
     """Add ``count`` samples from number ``t`` on of run ``r`` to its sums for averages."""
     P, error, nees, averages = s.P[r], s.error[r], s.nees[r], s.averages
     begin, errors_end, P_end = s.spans[r, 0], s.spans[r, 1], s.spans[r, 2]

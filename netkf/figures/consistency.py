@@ -19,8 +19,8 @@ from netkf.figures.style import (
     Picture,
     draw_legend,
     finish_figure,
+    label_text,
     new_figure,
-    plain,
     set_scale,
 )
 from netkf.linalg.arrays import FloatArray
@@ -178,7 +178,7 @@ def _draw_correlations(
         mean = all_curves.mean(axis=0)
         axes.plot(positions, mean, "-o", color=INK, ms=3.5, label="mean of all nodes")
     node, name = worst
-    label = plain(f"{name}, the largest" if len(curves) > 1 else name, 60)
+    label = label_text(f"{name}, the largest" if len(curves) > 1 else name, 60)
     axes.plot(positions, curves[node], "--s", color=SENSING, ms=3.5, label=label)
     axes.set(xlabel="lag, readings of the node", ylabel="autocorrelation of innovations")
     axes.xaxis.get_major_locator().set_params(integer=True)

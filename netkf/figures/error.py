@@ -21,8 +21,8 @@ from netkf.figures.style import (
     draw_legend,
     draw_message,
     finish_figure,
+    label_text,
     new_figure,
-    plain,
     set_scale,
 )
 from netkf.linalg.arrays import FloatArray
@@ -161,7 +161,7 @@ def _mark_worst(
             mfc="none",
             mec=INK,
             ls="",
-            label=f"worst of node {plain(data.nodes[k])}: {value:.3g} at {t:g} s",
+            label=f"worst of node {label_text(data.nodes[k])}: {value:.3g} at {t:g} s",
         )
         of_node = f"of node {data.nodes[k]} at {t:g} s"
         headline = headline or f"The largest {name} after the start is {value:.3g}, {of_node}"
@@ -235,6 +235,6 @@ def _draw_ratios(axes: Any, data: FigureData, rows: list[dict[str, Any]], key: s
             bars = widths[group] if data.runs > 1 else None
             style = {"fmt": marker, "color": colour, "mec": INK, "mew": 0.5, "ms": 4.5, "lw": 1.2}
             axes.errorbar(values[group], positions[group], xerr=bars, label=label, **style)
-    axes.set_yticks(positions, [plain(row["node"]) for row in rows], fontsize=6.5)
+    axes.set_yticks(positions, [label_text(row["node"]) for row in rows], fontsize=6.5)
     axes.margins(x=0.08)
     axes.set_ylim(-0.7, len(rows) - 0.3)

@@ -223,7 +223,7 @@ def _reduce_run(run: Run) -> FigureData:
         "lost": run.count("lost") + run.count("late"),
     }
     summary = stored_summary or summarise(run.scenario, sink, promised, messages)
-    return reduce_samples(
+    return collect_figure_data(
         run.scenario, sink, promised, summary, seed=run.seed, status=run.status, run=run
     )
 
@@ -231,7 +231,7 @@ def _reduce_run(run: Run) -> FigureData:
 def reduce_completed_run(scenario: Scenario, completed: CompletedRun) -> FigureData:
     """Return the data to draw of a run that was just written, for its run.png."""
     status = "diverged" if completed.samples.diverged else completed.status
-    return reduce_samples(
+    return collect_figure_data(
         scenario,
         completed.samples,
         completed.promised,
@@ -241,7 +241,7 @@ def reduce_completed_run(scenario: Scenario, completed: CompletedRun) -> FigureD
     )
 
 
-def reduce_samples(
+def collect_figure_data(
     scenario: Scenario,
     sink: SummarySink,
     promised: PromisedTraces,

@@ -13,7 +13,15 @@ from matplotlib.ticker import FuncFormatter
 
 from netkf.figures.figure_data import FigureData
 from netkf.figures.layout import Positions, get_positions
-from netkf.figures.style import INK, MUTED, SEQUENTIAL, Picture, finish_figure, new_figure, plain
+from netkf.figures.style import (
+    INK,
+    MUTED,
+    SEQUENTIAL,
+    Picture,
+    finish_figure,
+    label_text,
+    new_figure,
+)
 
 MAX_LINKS = 20_000
 MAX_LABELLED_NODES = 60
@@ -130,7 +138,9 @@ def draw_network(
         style: dict[str, Any] = {"fontsize": 6.5, "color": MUTED, "zorder": 3}
         style |= {"ha": "right" if left else "left", "va": "top" if below else "baseline"}
         offset = (-distance if left else distance, -distance if below else distance)
-        axes.annotate(plain(node), positions[node], offset, textcoords="offset points", **style)
+        axes.annotate(
+            label_text(node), positions[node], offset, textcoords="offset points", **style
+        )
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.13)
     axes.axis("off")

@@ -17,8 +17,8 @@ from netkf.figures.style import (
     Picture,
     draw_legend,
     finish_figure,
+    label_text,
     new_figure,
-    plain,
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.outcomes import Outcomes, delivery_matrix, fate_matrix, loss_windows, outcomes_of
@@ -82,7 +82,7 @@ def _draw_matrix(
     cmap = mpl.colormaps[colours].with_extremes(bad="white")
     image = axes.imshow(values, vmin=span[0], vmax=span[1], cmap=cmap, interpolation="nearest")
     places = select_evenly(np.arange(len(nodes)), MAX_TICKS)
-    names = [plain(nodes[k]) for k in places.tolist()]
+    names = [label_text(nodes[k]) for k in places.tolist()]
     is_tight = len(names) > MAX_NUMBERS or len(names) * max(map(len, names)) > MAX_LETTERS
     axes.set_xticks(places, names, fontsize=6.5, rotation=90 if is_tight else 0)
     axes.set_yticks(places, names, fontsize=6.5)
@@ -123,7 +123,7 @@ def losses_figure(data: FigureData) -> Picture:
     image = lower.pcolormesh(
         edges, np.arange(len(rows) + 1), shares[rows], vmin=0.0, vmax=1.0, cmap=cmap
     )
-    pairs = (map(plain, (data.nodes[k] for k in links[row])) for row in rows.tolist())
+    pairs = (map(label_text, (data.nodes[k] for k in links[row])) for row in rows.tolist())
     names = [f"{sender} to {receiver}" for sender, receiver in pairs]
     ticks = select_evenly(np.arange(len(rows)), MAX_TICKS)
     lower.set_yticks(ticks + 0.5, [names[k] for k in ticks.tolist()], fontsize=5.5)

@@ -17,7 +17,7 @@ from netkf.figures.style import (
     SENSING,
     draw_legend,
     draw_message,
-    plain,
+    label_text,
     set_scale,
 )
 from netkf.linalg.arrays import FloatArray
@@ -97,7 +97,7 @@ def draw_errors(axes: Any, data: FigureData, bound: bool = False) -> None:
             draw_message(axes, NO_TRUTH)
             return
         draw_nodes(axes, data, data.first_component, se=None)
-        label = f"estimate of {plain(data.scenario.state_labels[0])}"
+        label = f"estimate of {label_text(data.scenario.state_labels[0])}"
         axes.set(ylabel=label, xlabel=SECONDS)
         shade_downtimes(axes, data)
         draw_legend(axes)

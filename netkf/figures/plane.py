@@ -11,7 +11,7 @@ import numpy as np
 from netkf.figures.figure_data import FigureData, UnavailableError
 from netkf.figures.names import SERIES
 from netkf.figures.network import MAX_LABELLED_NODES
-from netkf.figures.style import INK, MUTED, Picture, finish_figure, new_figure, plain
+from netkf.figures.style import INK, MUTED, Picture, finish_figure, label_text, new_figure
 from netkf.linalg.arrays import FloatArray
 from netkf.trace.run import Run
 
@@ -53,7 +53,7 @@ def plane_figure(data: FigureData) -> Picture:
     axes.scatter(*landmarks.T, marker="+", s=45, linewidths=1.2, color=INK, zorder=4, label=label)
     for place, name in list(names.items())[:MAX_LABELLED_NODES]:
         axes.annotate(
-            plain(name), place, (3, 3), textcoords="offset points", fontsize=6, color=MUTED
+            label_text(name), place, (3, 3), textcoords="offset points", fontsize=6, color=MUTED
         )
     labels = ["true path", "estimate of the node", f"{LEVEL:.0%} of errors, by P"]
     for k, path in enumerate(paths):

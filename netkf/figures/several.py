@@ -19,9 +19,9 @@ from netkf.figures.style import (
     Picture,
     draw_legend,
     finish_figure,
+    label_text,
     message_figure,
     new_figure,
-    plain,
     set_scale,
     style_context,
 )
@@ -75,7 +75,7 @@ def errors_figure(curves: Sequence[ErrorCurve], origin: str = "") -> Picture:
 
 def _draw_curve(axes: Any, curve: ErrorCurve, k: int) -> None:
     style, again = SERIES[k % len(SERIES)], k // len(SERIES)
-    label = plain(curve.label, MAX_LABEL)
+    label = label_text(curve.label, MAX_LABEL)
     square = np.minimum(curve.square, MAX_DRAWN)
     marks: dict[str, Any] = {"marker": SERIES[again].marker, "ms": 3.5} if again else {}
     marks |= {"markevery": max(1, len(square) // 12)} if again else {}
@@ -104,7 +104,7 @@ def _draw_bounds(axes: Any, placed: Sequence[tuple[int, ErrorCurve]]) -> list[Fl
 
 def _unit(curves: Sequence[ErrorCurve]) -> str:
     units = {curve.unit for curve in curves}
-    return plain(units.pop() if len(units) == 1 else "units of the state")
+    return label_text(units.pop() if len(units) == 1 else "units of the state")
 
 
 def _high(curve: ErrorCurve) -> FloatArray:

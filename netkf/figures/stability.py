@@ -27,8 +27,8 @@ from netkf.figures.style import (
     Picture,
     draw_legend,
     finish_figure,
+    label_text,
     new_figure,
-    plain,
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.network.losses import Bernoulli
@@ -201,8 +201,8 @@ def _draw_sweep_map(axes: Any, table: Any, keys: list[str]) -> None:
         if len(rows):
             style = {"marker": marker, "ls": "", "ms": 8, "mec": LOST, "mfc": "none", "mew": 1.5}
             axes.plot(columns, rows, label=label, **style)
-    axes.set_xticks(range(len(x_values)), [plain(_format_value(value)) for value in x_values])
-    axes.set_yticks(range(len(y_values)), [plain(_format_value(value)) for value in y_values])
+    axes.set_xticks(range(len(x_values)), [label_text(_format_value(value)) for value in x_values])
+    axes.set_yticks(range(len(y_values)), [label_text(_format_value(value)) for value in y_values])
     axes.set(xlabel=keys[0], ylabel=keys[1])
     axes.figure.colorbar(image, ax=axes, label="largest RMS error, units of the state")
     draw_legend(axes)
@@ -228,7 +228,7 @@ def _axis_positions(set_scale: Callable[[str], Any], values: Any) -> tuple[Float
         return positions, []
     names = list(dict.fromkeys(values.astype(str)))
     positions = np.array([names.index(str(value)) for value in values], dtype=np.float64)
-    return positions, [plain(_format_value(name)) for name in names]
+    return positions, [label_text(_format_value(name)) for name in names]
 
 
 def _format_value(value: Any) -> str:

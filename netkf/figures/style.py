@@ -143,7 +143,7 @@ def _split_word(line: str, width: float, size: float, weight: str) -> list[str]:
     return [*pieces, line]
 
 
-def plain(text: object, most: int = 24) -> str:
+def label_text(text: object, most: int = 24) -> str:
     """Return a name as one line of at most ``most`` characters for an axis or a legend, where
     matplotlib takes dollar signs for formulas.
     """

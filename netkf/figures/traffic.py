@@ -25,8 +25,8 @@ from netkf.figures.style import (
     Picture,
     draw_legend,
     finish_figure,
+    label_text,
     new_figure,
-    plain,
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.connectivity import newest_heard, sent_at
@@ -240,7 +240,7 @@ def heard(messages: np.ndarray) -> np.ndarray:
 
 def _end_names(data: FigureData, direction: np.ndarray) -> tuple[str, str]:
     named, first = data.scenario.topology.named, direction[0]
-    return plain(named(int(first["sender"]))), plain(named(int(first["receiver"])))
+    return label_text(named(int(first["sender"]))), label_text(named(int(first["receiver"])))
 
 
 def wilson_interval(delivered: Any, total: Any) -> tuple[Any, Any]:

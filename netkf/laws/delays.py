@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.core.laws import WaitingLaw
-from netkf.laws.intervals import Comparison, Interval, deviation_interval, normal_interval
+from netkf.laws.intervals import Interval, LawComparison, deviation_interval, normal_interval
 from netkf.laws.losses import MIN_COUNT, direction_label
 from netkf.laws.waiting import (
     CELLS,
@@ -68,7 +68,7 @@ def count_delays(
 
 def compare_delays(
     counts: DelayCounts, links: Sequence[tuple[int, int]], level: float
-) -> tuple[Comparison, Comparison]:
+) -> tuple[LawComparison, LawComparison]:
     """Compare delays of R runs with their law: of all (the first comparison), the mean rank of each
     direction, with their ``links``, and neighbours; each of the three gets a third of ``level``.
     """
@@ -86,4 +86,4 @@ def compare_delays(
     if correlation is not None:
         label = "neighbouring ones, their correlation"
         distances.append((deviation_interval(0.0, correlation), label))
-    return law, Comparison(distances, "largest difference of a mean rank from 1/2")
+    return law, LawComparison(distances, "largest difference of a mean rank from 1/2")

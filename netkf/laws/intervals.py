@@ -54,7 +54,7 @@ class Interval(NamedTuple):
         return self.limits(value, factor)[1]
 
 
-class Comparison(NamedTuple):
+class LawComparison(NamedTuple):
     """Distances from what is stated, which should all be 0.
 
     distances : interval and label of each; together they miss with at most the level of the test
@@ -74,7 +74,7 @@ class Comparison(NamedTuple):
         return max(found, key=lambda item: item[0].low, default=None)
 
 
-NO_COMPARISON = Comparison([], "too few values in these runs")
+NO_COMPARISON = LawComparison([], "too few values in these runs")
 """The comparison of a test that has too few values to say anything."""
 
 

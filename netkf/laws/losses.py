@@ -12,8 +12,8 @@ import scipy
 from netkf.core.laws import Chain
 from netkf.laws.intervals import (
     NO_COMPARISON,
-    Comparison,
     Interval,
+    LawComparison,
     deviation_interval,
     excess_interval,
     probability_interval,
@@ -128,7 +128,7 @@ def count_outcomes(lost: np.ndarray, opposite: np.ndarray) -> LossCounts:
     )
 
 
-def compare_losses(law: LossLaw, counts: LossCounts, level: float) -> Comparison:
+def compare_losses(law: LossLaw, counts: LossCounts, level: float) -> LawComparison:
     """Compare the lost shares of R runs with the stated ones: of all directions together, of the
     same in each window of the run, and of every direction, with a third of ``level`` each.
     """
@@ -148,7 +148,7 @@ def compare_losses(law: LossLaw, counts: LossCounts, level: float) -> Comparison
         interval = _loss_interval(law, sent, lost, np.array([k]), single)
         distances.append((interval, direction_label(law.links[k])))
     text = f"{sent.sum():,.0f} messages, difference of the lost share"
-    return Comparison(distances, text, overall=1)
+    return LawComparison(distances, text, overall=1)
 
 
 def direction_label(link: tuple[int, int]) -> str:
@@ -221,7 +221,7 @@ def _share_at(centre: float, end: float, limit: float) -> float:
     return inner
 
 
-def compare_bursts(law: LossLaw, counts: LossCounts, level: float) -> Comparison:
+def compare_bursts(law: LossLaw, counts: LossCounts, level: float) -> LawComparison:
     """Compare the probability of a loss after a loss with that of the stated chain."""
     assert law.chain is not None
     followed = counts.followed.sum(axis=1)
@@ -234,10 +234,10 @@ def compare_bursts(law: LossLaw, counts: LossCounts, level: float) -> Comparison
     independent = total * probability * (1.0 - probability)
     distance = excess_interval(probability, excess, total, independent, level)
     text = f"{total:,.0f} losses, after which the next message is lost with a probability off"
-    return Comparison([(distance, "all directions")], text)
+    return LawComparison([(distance, "all directions")], text)
 
 
-def compare_shares(law: LossLaw, counts: LossCounts, level: float) -> Comparison:
+def compare_joint_losses(law: LossLaw, counts: LossCounts, level: float) -> LawComparison:
     """Compare how often two hearers of a broadcast lose it both, in R runs, with c q + (1 - c) q^2
     for the share c of broadcasts that have one fate and the probability q of a loss.
     """
@@ -248,10 +248,10 @@ def compare_shares(law: LossLaw, counts: LossCounts, level: float) -> Comparison
     excess = counts.alike - expected * pairs
     distance = excess_interval(expected, excess, total, total * expected, level)
     text = f"{total:,.0f} pairs of hearers, which lose a broadcast both with a probability off"
-    return Comparison([(distance, "all senders")], text)
+    return LawComparison([(distance, "all senders")], text)
 
 
-def compare_independence(law: LossLaw, counts: LossCounts, level: float) -> Comparison:
+def compare_independence(law: LossLaw, counts: LossCounts, level: float) -> LawComparison:
     """Compare losses of R runs with independent ones: of consecutive messages of a direction, of
     messages of the same number in opposite directions (unless both share one draw), and of
     different links; each of the three gets a third of ``level``.
@@ -277,7 +277,7 @@ def compare_independence(law: LossLaw, counts: LossCounts, level: float) -> Comp
         if found is not None:
             distances.append((found, "correlation of both directions of a link"))
     distances += _links_apart(law, counts, level / 3.0)
-    return Comparison(distances, "largest difference") if distances else NO_COMPARISON
+    return LawComparison(distances, "largest difference") if distances else NO_COMPARISON
 
 
 def neighbours_variance(p: Any) -> Any:
@@ -357,7 +357,7 @@ def mean_correlation(excess: FloatArray, variance: FloatArray, level: float) -> 
 
 def compare_matchings(
     p: FloatArray, counts: PairCounts, links: Sequence[tuple[int, int]], level: float
-) -> Comparison:
+) -> LawComparison:
     """Compare matchings of R runs with ``p`` (L,) of each link in a slot, independent of other
     slots: the number of pairs in a slot by Student's interval, for each link its probability by
     Clopper and Pearson, and its correlation with the next slot.
@@ -387,12 +387,12 @@ def compare_matchings(
         if correlation is not None:
             distances.append((correlation, f"{label} and the slot before, their correlation"))
     text = f"{runs * slots:,.0f} slots, largest difference of a share"
-    return Comparison(distances, text, overall=1)
+    return LawComparison(distances, text, overall=1)
 
 
 def compare_coincidences(
     events: np.ndarray, lags: Sequence[int], labels: Sequence[str], level: float
-) -> Comparison:
+) -> LawComparison:
     """Compare how often two of L events are ``lags`` steps apart, by ``events`` (R, K, L), 0 or 1,
     with independent ones of their frequencies: by Clopper and Pearson, shared among all pairs; each
     lag gives the pair that is least likely.
@@ -415,4 +415,4 @@ def compare_coincidences(
         limits = probability_interval(int(both[i, j]), count, single)
         label = f"{labels[i]} and, {lag} later, {labels[j]}"
         distances.append((deviation_interval(float(expected[i, j]), limits), label))
-    return Comparison(distances, "largest difference of a share")
+    return LawComparison(distances, "largest difference of a share")

@@ -15,8 +15,8 @@ import scipy
 
 from netkf.laws.intervals import (
     NO_COMPARISON,
-    Comparison,
     Interval,
+    LawComparison,
     correlation_interval,
     deviation_interval,
     normal_interval,
@@ -100,7 +100,7 @@ def moment_law(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, Fl
 
 def compare_variances(
     z: FloatArray, labels: Sequence[str], level: float, noun: str, gaussian: bool = True
-) -> Comparison:
+) -> LawComparison:
     """Compare the variances of noises with 1: of all entries, in each part of a run, and one by
     one, with a third of ``level`` for each. Sums of squares are chi-square; unless ``gaussian``
     with the degrees of freedom that match their variance, from the sample kurtosis.
@@ -141,12 +141,12 @@ def compare_variances(
             )
             distances.append((found, label))
     text = f"variances over the stated ones, {counts.sum():,.0f} values,"
-    return Comparison(distances, text, overall=1)
+    return LawComparison(distances, text, overall=1)
 
 
 def compare_means(
     z: FloatArray, labels: Sequence[str], level: float, states: FloatArray | None = None
-) -> Comparison:
+) -> LawComparison:
     """Compare the means of noises with 0, and their correlations with the ``states`` (R, 2, n, d)
     to which they are added, with half of ``level`` each; means of ``count`` entries have variance 1
     / count.
@@ -163,7 +163,7 @@ def compare_means(
         distances.append((deviation_interval(0.0, interval), label))
     text = "largest mean in standard deviations"
     text += ", or correlation with a state," if with_states else ""
-    return Comparison([*distances, *with_states], text)
+    return LawComparison([*distances, *with_states], text)
 
 
 def _with_states(
@@ -184,7 +184,7 @@ def _with_states(
 
 def compare_correlations(
     z: FloatArray, labels: Sequence[str], level: float, lags: Sequence[int] = LAGS
-) -> Comparison:
+) -> LawComparison:
     """Compare noises with white ones: no correlations between entries, with any entry one step
     before, of an entry with itself ``lags`` steps before, and of the size of an entry with that one
     step before (which would show a varying variance). All comparisons share the ``level``.
@@ -194,14 +194,14 @@ def compare_correlations(
     )
 
 
-def compare_entries(z: FloatArray, labels: Sequence[str], level: float) -> Comparison:
+def compare_entries(z: FloatArray, labels: Sequence[str], level: float) -> LawComparison:
     """Compare the correlations between entries of noises at the same time with 0."""
     return _compare_found(list(_between(z, labels)), level)
 
 
 def compare_with(
     z: FloatArray, other: FloatArray, labels: Sequence[str], others: Sequence[str], level: float
-) -> Comparison:
+) -> LawComparison:
     """Compare the correlations of noises with other numbers (R, S, e) of the same times, which must
     have mean 0 and are named ``others``, with 0.
     """
@@ -211,16 +211,16 @@ def compare_with(
     return _compare_found(found, level)
 
 
-def _compare_found(found: list[tuple[float, float, str]], level: float) -> Comparison:
+def _compare_found(found: list[tuple[float, float, str]], level: float) -> LawComparison:
     enough = [entry for entry in found if entry[1] >= MIN_COUNT]
     distances = [
         (deviation_interval(0.0, correlation_interval(value, count, level / len(enough))), label)
         for value, count, label in enough
     ]
-    return Comparison(distances, "largest correlation") if distances else NO_COMPARISON
+    return LawComparison(distances, "largest correlation") if distances else NO_COMPARISON
 
 
-def compare_cells(u: FloatArray, labels: Sequence[str], level: float, noun: str) -> Comparison:
+def compare_cells(u: FloatArray, labels: Sequence[str], level: float, noun: str) -> LawComparison:
     """Compare numbers u (R, S, d), which should be uniform in [0, 1), by how many are in each of
     CELLS equal parts: of all d columns together, and of each, with half of ``level`` each.
     """
@@ -243,10 +243,10 @@ def compare_cells(u: FloatArray, labels: Sequence[str], level: float, noun: str)
                 found = cell_interval(count, counts[column], single)
                 distances.append((found, f"{label}, {cell_label(k)}"))
     text = f"{counts.sum():,.0f} {noun}, largest difference of a share from 1/{CELLS}"
-    return Comparison(distances, text, overall=CELLS)
+    return LawComparison(distances, text, overall=CELLS)
 
 
-def compare_sides(e: FloatArray, others: FloatArray, level: float) -> Iterator[Comparison]:
+def compare_sides(e: FloatArray, others: FloatArray, level: float) -> Iterator[LawComparison]:
     """Compare mean and variance of noise ``e`` (N, q) where each of the numbers ``others`` (N, r)
     is above its median with those where it is below: noise that does not depend on them has none.
     """

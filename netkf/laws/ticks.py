@@ -13,8 +13,8 @@ from netkf.core.laws import EXPONENTIAL, Lattice, WaitingLaw
 from netkf.laws.intervals import (
     NO_COMPARISON,
     POWER,
-    Comparison,
     Interval,
+    LawComparison,
     detectable_shift_of_student,
     deviation_interval,
     poisson_interval,
@@ -259,7 +259,7 @@ def count_interval(
     return distance._replace(value=value, low=low, high=high, detectable=detectable, again=limits)
 
 
-def compare_gaps(counts: TickCounts, level: float) -> tuple[Comparison, Comparison]:
+def compare_gaps(counts: TickCounts, level: float) -> tuple[LawComparison, LawComparison]:
     """Compare the gaps of R runs with their law, and the correlation of neighbouring ones with 0;
     each gets half of ``level``.
     """
@@ -268,12 +268,12 @@ def compare_gaps(counts: TickCounts, level: float) -> tuple[Comparison, Comparis
     if correlation is None:
         return shares, NO_COMPARISON
     distance = deviation_interval(0.0, correlation)
-    return shares, Comparison([(distance, "neighbouring gaps")], "largest correlation")
+    return shares, LawComparison([(distance, "neighbouring gaps")], "largest correlation")
 
 
 def compare_clocks(
     group: ClockGroup, windows: np.ndarray, horizon: float, level: float
-) -> Comparison:
+) -> LawComparison:
     """Compare Poisson clocks with independent ones, from their ticks ``windows`` (R, W, E) in R
     runs of ``horizon`` seconds: the total count of a window is Poisson, so that its variance equals
     its mean, and no two clocks have correlated counts; each test gets half of ``level``.
@@ -292,7 +292,7 @@ def compare_clocks(
     if pairs is not None:
         correlation, (a, b) = pairs
         distances.append((correlation, f"correlation of {group.labels[a]} and {group.labels[b]}"))
-    return Comparison(distances, "largest difference")
+    return LawComparison(distances, "largest difference")
 
 
 def largest_correlation(

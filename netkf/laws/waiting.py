@@ -20,8 +20,8 @@ import scipy
 from netkf.core.laws import WaitingLaw
 from netkf.laws.intervals import (
     NO_COMPARISON,
-    Comparison,
     Interval,
+    LawComparison,
     correlation_interval,
     deviation_interval,
     probability_interval,
@@ -112,7 +112,7 @@ def neighbour_correlation(products: FloatArray, level: float) -> Interval | None
     return correlation_interval(float(total / squares), pairs, level)
 
 
-def compare_shares(cells: FloatArray, level: float, noun: str) -> Comparison:
+def compare_shares(cells: FloatArray, level: float, noun: str) -> LawComparison:
     """Compare waiting times with their law: how many are in cells of equal probability, and could
     be, (CELLS, 2), without cells that few runs can show.
     """
@@ -126,7 +126,7 @@ def compare_shares(cells: FloatArray, level: float, noun: str) -> Comparison:
     text = f"{cells[0, 1]:,.0f} {noun}, largest difference of a share from 1/{CELLS}"
     if len(visible) < CELLS:
         text += f" (runs are too short to show ranks above {(visible[-1] + 1) / CELLS:.2f})"
-    return Comparison(distances, text)
+    return LawComparison(distances, text)
 
 
 def cell_interval(count: float, total: float, level: float) -> Interval:

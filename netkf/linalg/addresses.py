@@ -47,7 +47,7 @@ def any_struct(struct: Struct) -> Any:
     return struct if is_plain() else AnyStruct.at(struct)
 
 
-def seen_as(cls: type[Struct], struct: Struct, **kinds: Any) -> Any:
+def viewed_as(cls: type[Struct], struct: Struct, **kinds: Any) -> Any:
     """Return a struct as one of ``cls``, whose fields it has too, at the same places; some may have
     other ``kinds`` than its own.
     """
@@ -71,7 +71,7 @@ def _first_fields(kernel: Any, record: Struct) -> Any:
     cls = _classes_read.get(kernel)
     if cls is None or is_plain():
         return record
-    seen, offsets = seen_as(cls, record), record.struct_offsets
+    seen, offsets = viewed_as(cls, record), record.struct_offsets
     alike = all(offsets.get(name) == word for name, word in cls.struct_offsets.items())
     return seen if alike else record
 

@@ -18,7 +18,7 @@ __all__ = [
     "ArrayLike",
     "FloatArray",
     "IntArray",
-    "address_of",
+    "array_address",
     "block_diagonal",
     "enlarged",
     "readonly_array",
@@ -31,7 +31,7 @@ __all__ = [
 ]
 
 
-def address_of(array: Any) -> int:
+def array_address(array: Any) -> int:
     """Return the address of the first byte of a C-contiguous numpy ``array``."""
     try:
         # A quarter of the time of ``array.ctypes.data``, of which a run needs some hundred.

@@ -51,7 +51,7 @@ register_model(GenericType)(models.OpaqueModel)
 
 
 @typeof_impl.register(Generic)
-def type_of(value: Generic, _: Any) -> GenericType:
+def function_type(value: Generic, _: Any) -> GenericType:
     """Return the numba type of a function whose name is in a kernel."""
     return GenericType(value)
 

@@ -32,13 +32,13 @@ def diagonalise(a: FloatArray, vectors: FloatArray) -> None:
                     a[p, q] = a[q, p] = 0.0
                 else:
                     turned = True
-                    rotate(a, vectors, p, q)
+                    jacobi_rotate(a, vectors, p, q)
         if not turned:
             return
 
 
 @kernel
-def rotate(a: FloatArray, vectors: FloatArray, p: int, q: int) -> None:
+def jacobi_rotate(a: FloatArray, vectors: FloatArray, p: int, q: int) -> None:
     """Apply the Jacobi rotation a <- J' a J, V <- V J in the plane (p, q) that makes a[p, q] 0, to
     the symmetric ``a`` (n, n) and V = ``vectors`` (n, n) in place.
     """

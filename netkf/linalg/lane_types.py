@@ -108,7 +108,7 @@ def _broadcast(context: Any, builder: Any, value: Any, kind: Any, count: int) ->
     return number if count == 1 else _splat(builder, number, count)
 
 
-def _alike(context: Any, builder: Any, sig: Any, args: Any) -> list[Any]:
+def _widen_all(context: Any, builder: Any, sig: Any, args: Any) -> list[Any]:
     """Emit all arguments as values of as many lanes as the widest has."""
     count = max(map(_count, sig.args))
     return [
@@ -378,7 +378,7 @@ def _arithmetic(operation: Any, name: str, result: Any, *signatures: Any) -> Non
 
     @_implement(operation, result, *signatures)
     def _operate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        alike = args if result is _same_kind else _alike(context, builder, sig, args)
+        alike = args if result is _same_kind else _widen_all(context, builder, sig, args)
         return getattr(builder, name)(*alike)
 
 
@@ -389,7 +389,7 @@ def _comparison(operation: Any, sign: str) -> None:
     def _compare(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         # As in C: comparisons with nan are false, but != is true.
         compare = builder.fcmp_unordered if sign == "!=" else builder.fcmp_ordered
-        return compare(sign, *_alike(context, builder, sig, args))
+        return compare(sign, *_widen_all(context, builder, sig, args))
 
 
 for _name, _method in (("add", "fadd"), ("sub", "fsub"), ("mul", "fmul"), ("truediv", "fdiv")):
@@ -412,7 +412,7 @@ def _instruction(function: Any, name: str) -> None:
 
     @_implement(function, _widest)
     def _emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        values, count = _alike(context, builder, sig, args), _count(sig.return_type)
+        values, count = _widen_all(context, builder, sig, args), _count(sig.return_type)
         # Intrinsics are named by their type: llvm.sqrt.f64 or, for eight lanes, llvm.sqrt.v8f64.
         full = f"llvm.{name}.{'f64' if count == 1 else f'v{count}f64'}"
         return _call(builder, full, values[0].type, values)

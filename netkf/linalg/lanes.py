@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.linalg.arrays import FloatArray, address_of
+from netkf.linalg.arrays import FloatArray, array_address
 
 LANES = 8
 """Runs side by side: as many float64 as the widest registers of common processors hold."""
@@ -40,7 +40,7 @@ def aligned(shape: tuple[int, ...], dtype: Any = np.float64) -> Any:
     size = math.prod(shape) * np.dtype(dtype).itemsize
     # numpy aligns to 16 bytes only: take more, and begin at the next line of the cache.
     memory = np.zeros(size + ALIGNMENT, dtype=np.uint8)
-    start = -address_of(memory) % ALIGNMENT
+    start = -array_address(memory) % ALIGNMENT
     return memory[start : start + size].view(dtype).reshape(shape)
 
 
@@ -49,7 +49,7 @@ def unset(shape: tuple[int, ...]) -> Any:
     anything in it: for large arrays that are filled at once.
     """
     memory = np.empty(math.prod(shape) + ALIGNMENT // 8)
-    start = -address_of(memory) % ALIGNMENT // 8
+    start = -array_address(memory) % ALIGNMENT // 8
     return memory[start : start + math.prod(shape)].reshape(shape)
 
 

@@ -32,7 +32,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from netkf.linalg.arrays import address_of
+from netkf.linalg.arrays import array_address
 from netkf.linalg.plain import is_plain, with_fields
 
 FloatArray = NDArray[np.float64]
@@ -121,13 +121,13 @@ class Struct(metaclass=StructClass):
             elif kind is np.float64:
                 floats.append((word, value))
             else:
-                for k, part in enumerate(self._kept(name, value, kind), word):
+                for k, part in enumerate(self._keep_alive(name, value, kind), word):
                     words[k] = part
         memory = np.array(words, dtype=np.int64)
         numbers = memory.view(np.float64)
         for word, value in floats:
             numbers[word] = value
-        self.__dict__.update(memory=memory, address=address_of(memory))
+        self.__dict__.update(memory=memory, address=array_address(memory))
         _structs[self.address] = self
 
     @classmethod
@@ -136,7 +136,7 @@ class Struct(metaclass=StructClass):
         arrays that it tells the addresses of; they must be kept elsewhere.
         """
         made = object.__new__(cls)
-        made.__dict__.update(memory=memory, address=address_of(memory))
+        made.__dict__.update(memory=memory, address=array_address(memory))
         for name, kind in cls.struct_kinds.items():
             words = memory[cls.struct_offsets[name] :]
             if isinstance(kind, int):
@@ -198,10 +198,10 @@ class Struct(metaclass=StructClass):
             # Integers and floats share the words, seen as one or the other type.
             self.memory.view(kind)[word] = value
         else:
-            for k, part in enumerate(self._kept(name, value, kind), word):
+            for k, part in enumerate(self._keep_alive(name, value, kind), word):
                 self.memory[k] = part
 
-    def _kept(self, name: str, value: Any, kind: Any) -> tuple[int, ...]:
+    def _keep_alive(self, name: str, value: Any, kind: Any) -> tuple[int, ...]:
         """Keep an array, a struct or a sized tuple alive, and return its words."""
         if isinstance(kind, tuple):
             # Compiled code assumes the type and computes strides itself: anything else would read
@@ -210,7 +210,7 @@ class Struct(metaclass=StructClass):
                 raise TypeError(f"{type(self).__name__}.{name} is a C-contiguous array {kind}")
             # The dictionary keeps the array alive, since the memory holds its address only.
             self.__dict__[name] = with_fields(value) if is_plain() else value
-            return address_of(value), *value.shape
+            return array_address(value), *value.shape
         # Of a tuple, ``size``, only its length matters, which is part of the numba type.
         if not isinstance(kind, int) and type(value) is not kind:
             raise TypeError(f"{type(self).__name__}.{name} is a {kind.__name__}")
@@ -294,6 +294,6 @@ def struct_at(memory: np.ndarray, cls: type[Derived]) -> Derived:
     """Return, in kernels, the struct of class ``cls`` whose block of int64 words is ``memory``
     (words,).
     """
-    known: Any = _structs.get(address_of(memory))
+    known: Any = _structs.get(array_address(memory))
     found: Derived = cls.from_memory(memory) if known is None else known
     return found

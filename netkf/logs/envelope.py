@@ -17,7 +17,7 @@ from netkf.core.fields import SourceFile
 from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import Progress, replicate
 from netkf.linalg.arrays import FloatArray
-from netkf.logs.outcomes import Chain
+from netkf.logs.outcomes import FittedChain
 from netkf.network.losses import GilbertElliott
 from netkf.network.scheduled import ScheduledLoss
 from netkf.runs.connectivity import ConnectivitySink
@@ -45,7 +45,7 @@ Interval = tuple[float, float, tuple[str, str], int]
 """From and until (s), a link, and the index of the delivery that it then has."""
 
 
-class Law(NamedTuple):
+class FittedLaw(NamedTuple):
     """A law of losses fitted to a log.
 
     values : of NAMES; per-link: the deliveries of the L ``links``; per-link-bursts: to_bad of each
@@ -72,7 +72,7 @@ class Law(NamedTuple):
             return np.asarray(random.beta(heard + 0.5, count - heard + 0.5))
         assert self.cov is not None
         if self.kind == "gilbert-elliott":
-            return Chain(self.values, self.cov, 0.0).draw(random)
+            return FittedChain(self.values, self.cov, 0.0).draw(random)
         while True:
             one, two = random.multivariate_normal(self.values, self.cov)
             if self.kind == "shared":
@@ -153,7 +153,7 @@ def edges_with(scenario: Scenario, deliveries: dict[tuple[str, str], float]) -> 
 
 def compare_with_laws(
     scenario: Scenario,
-    laws: list[Law],
+    laws: list[FittedLaw],
     delay: dict[str, Any],
     runs: int | None,
     confidence: float,
@@ -200,7 +200,7 @@ def compare_with_laws(
 
 
 def law_run(
-    scenario: Scenario, seed: int, replica: int, law: Law, delay: dict[str, Any]
+    scenario: Scenario, seed: int, replica: int, law: FittedLaw, delay: dict[str, Any]
 ) -> dict[str, float]:
     """Return the quantities of one run of a law with parameters drawn from their posterior."""
     random = np.random.default_rng([STREAM, seed, replica])

@@ -12,7 +12,7 @@ import pandas as pd
 
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import as_path
-from netkf.logs.importing import write_files
+from netkf.logs.importing import write_folder
 from netkf.logs.packet_tables import EXPORTED
 from netkf.logs.recorded_network import Files
 from netkf.network.clocks import LinkClock
@@ -61,7 +61,7 @@ def export_recorded(run: Run, out: str | Path) -> tuple[Path, ...]:
     given = {source.name: source.full for source in source_files(scenario)}
     files |= {name: path for name, path in given.items() if f'"{name}"' in text}
     files["scenario.toml"] = text
-    write_files(folder, files)
+    write_folder(folder, files)
     return tuple(folder / name for name in files)
 
 
@@ -204,5 +204,5 @@ def export_log(run: Run, out: str | Path) -> tuple[Path, ...]:
     files |= {source.name: source.full for source in source_files(scenario)}
     resolved = resolve_defaults(scenario)
     files["scenario.toml"] = to_toml({**resolved, "seed": run.seed})
-    write_files(folder, files)
+    write_folder(folder, files)
     return tuple(folder / name for name in files)

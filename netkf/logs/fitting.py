@@ -21,9 +21,9 @@ from netkf.ensembles.replicas import Progress
 from netkf.figures.names import FIT_FILE
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.logs import outcomes as stats
-from netkf.logs.envelope import COLUMNS, Interval, Law, compare_with_laws
-from netkf.logs.outcomes import Outcomes, Test, make_outcomes
-from netkf.logs.packets import UNREPORTED, parse_numbers, read_texts
+from netkf.logs.envelope import COLUMNS, FittedLaw, Interval, compare_with_laws
+from netkf.logs.outcomes import LogOutcomes, Test, make_outcomes
+from netkf.logs.packets import UNREPORTED, parse_numbers, read_text_rows
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.runs.files import write_text
 from netkf.scenario.reading import load
@@ -168,7 +168,7 @@ def fit_log(
         delivery, part = laws[0].values[0], min(share.value, 1.0)
         likelihood, variance = stats.shared_law(outcomes, delivery, part)
         cov = np.diag([variance * shrink, share.error**2])
-        laws.append(Law("shared", np.array([delivery, part]), likelihood, cov=cov))
+        laws.append(FittedLaw("shared", np.array([delivery, part]), likelihood, cov=cov))
     laws += _varying_laws(outcomes, edges, tests, shrink, scenario.horizon)
     needs = dict(NEEDS)
     if scenario.positions.moving:
@@ -257,7 +257,7 @@ def _tell_channels(
 
 def _read_table(path: Path) -> pd.DataFrame:
     """Return a table of messages, one row each; raises ScenarioError, with the line."""
-    table = read_texts(path)
+    table = read_text_rows(path)
     for name in [*KEY, "t", "transmission", "delivered"]:
         if name in table and name not in KEY[:2]:
             table[name] = parse_numbers(path, table, name)
@@ -295,7 +295,7 @@ def _complete_replay(
 
 
 def run_tests(
-    outcomes: Outcomes, distance: Distances | None
+    outcomes: LogOutcomes, distance: Distances | None
 ) -> tuple[dict[str, Test], stats.Share, float, FloatArray]:
     """Return a test of each assumption, the shared fate, the correlation time in packets, and the
     edges of windows of time in which quality hardly changes.
@@ -332,7 +332,7 @@ def run_tests(
     return found, share, time, edges
 
 
-def _direction_test(outcomes: Outcomes, counts: FloatArray, slack: float) -> dict[str, Test]:
+def _direction_test(outcomes: LogOutcomes, counts: FloatArray, slack: float) -> dict[str, Test]:
     """Return the test that both directions of pairs have one delivery, if any have two."""
     index = {link: k for k, link in enumerate(outcomes.links)}
     both = [(k, index[j, i]) for (i, j), k in index.items() if i < j and (j, i) in index]
@@ -386,7 +386,7 @@ class Distances(NamedTuple):
         return np.asarray(np.bincount(self.link, self.packets * values) / np.maximum(total, 1.0))
 
 
-def _distances(scenario: Scenario, outcomes: Outcomes, table: pd.DataFrame) -> Distances | None:
+def _distances(scenario: Scenario, outcomes: LogOutcomes, table: pd.DataFrame) -> Distances | None:
     """Return the distances of the ends of links; None if the log does not tell them."""
     places, nodes = scenario.positions, {str(node): node for node in scenario.nodes}
     if places.of_state or not all(places.has(node) for node in nodes.values()):
@@ -409,7 +409,7 @@ def _distances(scenario: Scenario, outcomes: Outcomes, table: pd.DataFrame) -> D
 
 
 def _link_table(
-    outcomes: Outcomes,
+    outcomes: LogOutcomes,
     table: pd.DataFrame,
     level: float,
     shrink: float,
@@ -443,19 +443,19 @@ def _link_table(
 
 
 def _fit_laws(
-    outcomes: Outcomes,
+    outcomes: LogOutcomes,
     links: pd.DataFrame,
     distance: Distances | None,
     shrink: float,
     bursty: bool,
-) -> list[Law]:
+) -> list[FittedLaw]:
     count, heard = outcomes.counts.T.astype(float)
     total = np.array([count.sum(), heard.sum()])
     laws = [
-        Law(
+        FittedLaw(
             "bernoulli", total[1:] / total[0], _likelihood(total[1], total[0]), total[None] / shrink
         ),
-        Law(
+        FittedLaw(
             "per-link",
             heard / count,
             _likelihood(heard, count),
@@ -464,7 +464,7 @@ def _fit_laws(
     ]
     if bursty:
         chain = stats.fit_chain(outcomes)
-        laws.append(Law("gilbert-elliott", chain.values, chain.likelihood, cov=chain.cov))
+        laws.append(FittedLaw("gilbert-elliott", chain.values, chain.likelihood, cov=chain.cov))
         # Of each link heard packets that turn to lost ones, and the other way.
         turns = np.concatenate(np.split(outcomes.transitions, 2, axis=1))
         values = (turns[:, 1] + 0.5) / (turns[:, 0] + 1.0)
@@ -474,7 +474,7 @@ def _fit_laws(
         (tries, lost), (losses, found) = (part.T for part in np.split(turns, 2))
         n, k = count - tries - losses, heard - (tries - lost + found)
         fit += float(np.sum(xlogy(k, good / (bad + good)) + xlogy(n - k, bad / (bad + good))))
-        laws.append(Law("per-link-bursts", values, fit, turns))
+        laws.append(FittedLaw("per-link-bursts", values, fit, turns))
     if distance is not None and len(count) > 2:
         # What follows from places that change is no correlation in time.
         moves = len(distance.value) > len(count)
@@ -482,14 +482,14 @@ def _fit_laws(
         p, count, heard = expit((values[0] - distance.value) / values[1]), *distance[1:3]
         fit = float((xlogy(heard, p) + xlog1py(count - heard, -p)).sum())
         if values[1] > 0.0 and values[0] >= 0.0:
-            laws.append(Law("distance", values, fit, cov=cov))
+            laws.append(FittedLaw("distance", values, fit, cov=cov))
     pairs = tuple(links[["sender", "receiver"]].itertuples(index=False, name=None))
     return [law._replace(links=pairs) for law in laws]
 
 
 def _varying_laws(
-    outcomes: Outcomes, edges: FloatArray, tests: Mapping[str, Test], shrink: float, end: float
-) -> list[Law]:
+    outcomes: LogOutcomes, edges: FloatArray, tests: Mapping[str, Test], shrink: float, end: float
+) -> list[FittedLaw]:
     """Return laws whose delivery changes in time or with the channel, where the log tells of it."""
     index, laws = list(outcomes.links), []
     if len(edges):
@@ -509,7 +509,7 @@ def _varying_laws(
     return laws
 
 
-def _hops(outcomes: Outcomes, numbers: Mapping[str, int], end: float) -> list[Interval]:
+def _hops(outcomes: LogOutcomes, numbers: Mapping[str, int], end: float) -> list[Interval]:
     """Return an interval around each transmission, with the number of its channel."""
     sent: dict[int, list[tuple[float, int]]] = {}
     for group, channel in zip(outcomes.groups, outcomes.channels, strict=True):
@@ -525,10 +525,10 @@ def _hops(outcomes: Outcomes, numbers: Mapping[str, int], end: float) -> list[In
     return rows
 
 
-def _varying_law(kind: str, counts: FloatArray, rows: list[Interval], shrink: float) -> Law:
+def _varying_law(kind: str, counts: FloatArray, rows: list[Interval], shrink: float) -> FittedLaw:
     heard, likelihood = counts[:, 1], _likelihood(counts[:, 1], counts[:, 0])
     values = heard / counts[:, 0]
-    return Law(kind, values, likelihood, counts / shrink, rows=tuple(rows))
+    return FittedLaw(kind, values, likelihood, counts / shrink, rows=tuple(rows))
 
 
 def _likelihood(heard: Any, count: Any) -> float:
@@ -537,7 +537,7 @@ def _likelihood(heard: Any, count: Any) -> float:
 
 
 def _law_table(
-    laws: list[Law], rejected: set[str], count: int, needs: Mapping[str, tuple[str, ...]]
+    laws: list[FittedLaw], rejected: set[str], count: int, needs: Mapping[str, tuple[str, ...]]
 ) -> pd.DataFrame:
     rows = []
     for law in laws:
@@ -584,7 +584,7 @@ def _write(
     folder: Path,
     scenario: Scenario,
     tables: tuple[pd.DataFrame, ...],
-    laws: list[Law],
+    laws: list[FittedLaw],
     delay: dict[str, Any],
 ) -> dict[str, Path]:
     """Write the tables, and a scenario for each law; return the paths of these by law."""

@@ -76,14 +76,14 @@ def import_log(
         if path.exists():
             rule = "is there already, and nothing is overwritten"
             raise ScenarioError(str(path), rule, None, "choose another folder or remove it")
-    write_files(folder, files)
+    write_folder(folder, files)
     return tuple(paths), notes
 
 
 UNREPORTED = ("unknown", "lost")
 
 
-def write_files(folder: Path, files: Files) -> None:
+def write_folder(folder: Path, files: Files) -> None:
     """Write texts, and copy files, by name into a folder. Raises WriteError."""
     make_directory(folder)
     for name, content in files.items():

@@ -16,14 +16,14 @@ import pandas as pd
 from netkf.core.errors import ScenarioError
 from netkf.core.printable import count_phrase
 from netkf.linalg.arrays import FloatArray
-from netkf.logs.packet_tables import find_extra, read_positions
+from netkf.logs.packet_tables import find_extra, read_log_positions
 from netkf.logs.packets import (
     PacketLog,
     choose_origin,
     note_count,
     parse_numbers,
     parse_stamps,
-    read_texts,
+    read_text_rows,
     spread_equal,
 )
 
@@ -71,12 +71,12 @@ def read_mercator(log: Path) -> PacketLog:
     sends = sends[["sender", "t", "channel", "to", "sent", "logged"]]
     result = PacketLog(sends, outcomes, origin, 1.0, "lost", notes)
     if places is not None:
-        result.positions = read_positions(places, origin, notes)
+        result.positions = read_log_positions(places, origin, notes)
     return result
 
 
 def _read(path: Path, notes: list[str]) -> tuple[pd.DataFrame, list[Decimal]]:
-    raw = read_texts(path)
+    raw = read_text_rows(path)
     missing = [name for name in COLUMNS if name not in raw.columns]
     if missing:
         rule = f"must have the columns of mercator; there is no {missing[0]}"

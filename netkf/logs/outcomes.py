@@ -92,7 +92,7 @@ class Group(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Outcomes:
+class LogOutcomes:
     """The outcomes of a log: L ``links`` (sender, receiver), and the ``groups``."""
 
     links: tuple[tuple[str, str], ...]
@@ -162,7 +162,7 @@ def draw_channels(table: pd.DataFrame, random: np.random.Generator) -> pd.DataFr
     return table.assign(channel=table["channel"].where(table["channel"] != "", found))
 
 
-def make_outcomes(table: pd.DataFrame) -> Outcomes:
+def make_outcomes(table: pd.DataFrame) -> LogOutcomes:
     """Return the outcomes of a ``table`` of messages: sender, receiver, message, t, transmission,
     delivered (nan: unknown), and maybe channel.
     """
@@ -189,10 +189,10 @@ def make_outcomes(table: pd.DataFrame) -> Outcomes:
         ids = np.array([index[str(sender), str(receiver)] for receiver in wide.columns])
         groups.append(Group(wide.to_numpy(dtype=float), order["t"].to_numpy(), follows, ids))
         channels.append(str(name))
-    return Outcomes(tuple(links), tuple(groups), tuple(channels))
+    return LogOutcomes(tuple(links), tuple(groups), tuple(channels))
 
 
-def split_at(outcomes: Outcomes, edges: FloatArray) -> Outcomes:
+def split_at(outcomes: LogOutcomes, edges: FloatArray) -> LogOutcomes:
     """Return the outcomes with groups of one window of time each, which ``edges`` (K - 1,) part."""
     groups, channels = [], []
     for group, channel in zip(outcomes.groups, outcomes.channels, strict=True):
@@ -202,10 +202,10 @@ def split_at(outcomes: Outcomes, edges: FloatArray) -> Outcomes:
             follows = group.follows[own] & (np.arange(len(own)) > 0)
             groups.append(Group(group.x[own], group.t[own], follows, group.links))
             channels.append(channel)
-    return Outcomes(outcomes.links, tuple(groups), tuple(channels))
+    return LogOutcomes(outcomes.links, tuple(groups), tuple(channels))
 
 
-def counts_in(outcomes: Outcomes, edges: FloatArray) -> np.ndarray:
+def counts_in(outcomes: LogOutcomes, edges: FloatArray) -> np.ndarray:
     """Return known outcomes and packets heard in the K windows of ``edges`` (K - 1,), (K, 2)."""
     counts = np.zeros((len(edges) + 1, 2))
     for group in outcomes.groups:
@@ -215,7 +215,7 @@ def counts_in(outcomes: Outcomes, edges: FloatArray) -> np.ndarray:
     return counts
 
 
-def choose_windows(outcomes: Outcomes) -> FloatArray:
+def choose_windows(outcomes: LogOutcomes) -> FloatArray:
     """Return the edges (K - 1,) of windows of time, each of which parts what stood undivided best:
     by more than chance would at any of its places.
     """
@@ -273,7 +273,7 @@ def long_run_sum(units: FloatArray, lags: int) -> float:
     return max(total, 0.0)
 
 
-def autocorrelation(outcomes: Outcomes, lag: int) -> tuple[FloatArray, float]:
+def lagged_products(outcomes: LogOutcomes, lag: int) -> tuple[FloatArray, float]:
     """Return products of residuals ``lag`` transmissions apart (T,), and their sum for a
     correlation of 1.
     """
@@ -299,12 +299,12 @@ def _unbroken(follows: np.ndarray, lag: int) -> np.ndarray:
     return np.asarray(steps[lag + 1 :] - steps[1:-lag] == lag)
 
 
-def correlation_time(outcomes: Outcomes) -> float:
+def correlation_time(outcomes: LogOutcomes) -> float:
     """Return 1 + 2 sum of autocorrelations, cut at noise: packets for one independent packet."""
     total = 0.0
     longest = max(len(group.t) for group in outcomes.groups)
     for lag in range(1, longest // 4):
-        units, scale = autocorrelation(outcomes, lag)
+        units, scale = lagged_products(outcomes, lag)
         if scale <= 0.0 or units.sum() < 2.0 * math.sqrt(long_run_sum(units, 0)):
             break
         # The mean of correlated packets takes more than that of independent ones.
@@ -312,19 +312,19 @@ def correlation_time(outcomes: Outcomes) -> float:
     return 1.0 + (total / (1.0 - taken) if total else 0.0)
 
 
-def fast_time(outcomes: Outcomes, parts: int) -> float:
+def fast_time(outcomes: LogOutcomes, parts: int) -> float:
     """Return the correlation time within so many parts of the log: slow changes are not seen."""
     t = np.concatenate([group.t for group in outcomes.groups])
     return correlation_time(split_at(outcomes, np.quantile(t, np.arange(1, parts) / parts)))
 
 
-def test_time(outcomes: Outcomes) -> Test:
+def test_time(outcomes: LogOutcomes) -> Test:
     """Test that a packet's outcome does not depend on that of the one before."""
-    units, scale = autocorrelation(outcomes, 1)
+    units, scale = lagged_products(outcomes, 1)
     return _z_test("packets are independent in time", "correlation with the next", units, scale)
 
 
-def test_memory(outcomes: Outcomes) -> Test:
+def test_memory(outcomes: LogOutcomes) -> Test:
     """Test that given the last outcome the one before says nothing, as in a chain of two states."""
     units, scale = [], 0.0
     for group in outcomes.groups:
@@ -356,7 +356,7 @@ class Share(NamedTuple):
     lasting: float
 
 
-def shared_fate(outcomes: Outcomes, lags: int) -> tuple[Share, Test]:
+def shared_fate(outcomes: LogOutcomes, lags: int) -> tuple[Share, Test]:
     """Return the share c of transmissions whose hearers have one fate, which makes covariances of
     hearers c (min(p, q) - p q), and the test that it is 0.
     """
@@ -396,7 +396,7 @@ def shared_fate(outcomes: Outcomes, lags: int) -> tuple[Share, Test]:
     return Share(share, error, 0.5 * lasting / scale), found
 
 
-def shared_law(outcomes: Outcomes, delivery: float, share: float) -> tuple[float, float]:
+def shared_law(outcomes: LogOutcomes, delivery: float, share: float) -> tuple[float, float]:
     """Return the log-likelihood of one delivery and share, and the variance of the mean."""
     likelihood = spread = 0.0
     for group in outcomes.groups:
@@ -409,7 +409,7 @@ def shared_law(outcomes: Outcomes, delivery: float, share: float) -> tuple[float
     return likelihood, spread / float(outcomes.counts[:, 0].sum()) ** 2
 
 
-def _shrinkage(outcomes: Outcomes) -> float:
+def _shrinkage(outcomes: LogOutcomes) -> float:
     """Return the share of the spread of estimated deliveries that is not noise."""
     between = noise = 0.0
     for group in outcomes.groups:
@@ -424,7 +424,7 @@ def _shrinkage(outcomes: Outcomes) -> float:
     return max(0.0, 1.0 - noise / between) if between > 0.0 else 0.0
 
 
-def test_constancy(outcomes: Outcomes) -> Test:
+def test_constancy(outcomes: LogOutcomes) -> Test:
     """Test by correlations of BLOCKS means that deliveries do not change slowly."""
     time = fast_time(outcomes, 3 * LAGS)
     name, what = "quality does not change in time", "deviation of delivery over time"
@@ -481,7 +481,7 @@ def test_identical(
     return Test(assumption, what, math.sqrt(excess * size), p, unit, freedom)
 
 
-def residual_spread(outcomes: Outcomes, share: float, time: float) -> FloatArray:
+def residual_spread(outcomes: LogOutcomes, share: float, time: float) -> FloatArray:
     """Return the eigenvalues (L,) of the covariance of standardised residuals of links."""
     share = min(max(share, 0.0), 1.0) if np.isfinite(share) else 0.0
     senders = pd.Series([sender for sender, _ in outcomes.links]).value_counts().to_numpy()
@@ -490,7 +490,7 @@ def residual_spread(outcomes: Outcomes, share: float, time: float) -> FloatArray
 
 
 @dataclass(frozen=True, eq=False)
-class Chain:
+class FittedChain:
     """A Gilbert-Elliott chain that all links follow: ``values`` to_bad, to_good, deliver_good,
     deliver_bad; ``cov`` (4, 4) of their logits; ``likelihood`` the logarithm.
     """
@@ -504,7 +504,7 @@ class Chain:
         return expit(random.multivariate_normal(logit(self.values), self.cov))
 
 
-def fit_chain(outcomes: Outcomes) -> Chain:
+def fit_chain(outcomes: LogOutcomes) -> FittedChain:
     """Return the chain of two states that makes the outcomes likeliest, links alike."""
     stretches = _pad_stretches(outcomes)
     count, heard = outcomes.counts.sum(axis=0)
@@ -526,15 +526,15 @@ def fit_chain(outcomes: Outcomes) -> Chain:
     values, x = expit(best.x), best.x
     if values[2] < values[3]:  # the states changed their names
         x = x[[1, 0, 3, 2]]
-    return Chain(expit(x), _inverse_curvature(x, stretches), -float(best.fun))
+    return FittedChain(expit(x), _inverse_curvature(x, stretches), -float(best.fun))
 
 
-def _sum_of(outcomes: Outcomes, lag: int) -> float:
-    units, scale = autocorrelation(outcomes, lag)
+def _sum_of(outcomes: LogOutcomes, lag: int) -> float:
+    units, scale = lagged_products(outcomes, lag)
     return float(units.sum() / scale) if scale > 0.0 else 0.0
 
 
-def _pad_stretches(outcomes: Outcomes) -> np.ndarray:
+def _pad_stretches(outcomes: LogOutcomes) -> np.ndarray:
     """Return outcomes of unbroken stretches, (S, T) codes 0, 1, 2 unknown, 3 beyond the end."""
     parts = [
         np.where(np.isfinite(part), part, 2.0)

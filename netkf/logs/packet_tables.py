@@ -24,7 +24,7 @@ from netkf.logs.packets import (
     note_count,
     parse_numbers,
     parse_stamps,
-    read_texts,
+    read_text_rows,
     refuse_rows,
     spread_equal,
     unwrap,
@@ -86,7 +86,7 @@ def read_tables(log: Path, columns: Mapping[str, str]) -> PacketLog:
     ScenarioError.
     """
     notes: list[str] = []
-    tables = _rename({path: read_texts(path) for path in _packet_paths(log)}, columns)
+    tables = _rename({path: read_text_rows(path) for path in _packet_paths(log)}, columns)
     rows = _join([_read_rows(path, raw, notes) for path, raw in tables.items()])
     extras = {name: find_extra(log, name) for name in EXTRAS}
     resolution = find_resolution(rows.stamps)
@@ -123,7 +123,7 @@ def read_tables(log: Path, columns: Mapping[str, str]) -> PacketLog:
         # The log says itself what was lost.
         result.absent = "unknown"
     if extras["positions"] is not None:
-        result.positions = read_positions(extras["positions"], origin, notes)
+        result.positions = read_log_positions(extras["positions"], origin, notes)
     if extras["readings"] is not None:
         result.readings = read_readings(extras["readings"], origin, notes)
     return result
@@ -507,11 +507,11 @@ def _merge_rows(rows: pd.DataFrame, notes: list[str], log: str) -> pd.DataFrame:
     return ordered.drop_duplicates(key)[columns].reset_index(drop=True)
 
 
-def read_positions(path: Path, origin: Decimal, notes: list[str]) -> pd.DataFrame:
+def read_log_positions(path: Path, origin: Decimal, notes: list[str]) -> pd.DataFrame:
     """Return a table node, x, y, or t (s from ``origin``), node, x, y of nodes that move; raises
     ScenarioError.
     """
-    raw = read_texts(path)
+    raw = read_text_rows(path)
     stamp, name = find_column(raw, "t"), find_column(raw, "node") or raw.columns[0]
     columns = {}
     for axis in ("x", "y"):
@@ -523,7 +523,7 @@ def read_positions(path: Path, origin: Decimal, notes: list[str]) -> pd.DataFram
     stamps = parse_stamps(path, raw, stamp) if stamp else [origin] * len(raw)
     times = [float(s - origin) for s in stamps]
     table = pd.DataFrame({"t": times, "node": raw[name].to_numpy(), **columns}, index=raw.index)
-    _refuse_two_places(path, table, "one position" + (" at a time" if stamp else ""))
+    _refuse_two_positions(path, table, "one position" + (" at a time" if stamp else ""))
     kept = table.drop_duplicates(["t", "node"]).sort_values(["t", "node"], kind="stable")
     note_count(notes, len(table) - len(kept), "row", "merged: {} of " + path.name)
     # The first place of a node that was placed later counts from the beginning.
@@ -533,7 +533,7 @@ def read_positions(path: Path, origin: Decimal, notes: list[str]) -> pd.DataFram
     return kept.reset_index(drop=True) if stamp else kept.drop(columns="t")
 
 
-def _refuse_two_places(path: Path, table: pd.DataFrame, what: str) -> None:
+def _refuse_two_positions(path: Path, table: pd.DataFrame, what: str) -> None:
     for (_, node), rows in table.groupby(["t", "node"]):
         places = rows.drop_duplicates(["x", "y"])
         if len(places) > 1:
@@ -543,7 +543,7 @@ def _refuse_two_places(path: Path, table: pd.DataFrame, what: str) -> None:
 
 def read_readings(path: Path, origin: Decimal, notes: list[str], column: str = "") -> pd.DataFrame:
     """Return t (s from ``origin``), node, y0 of a ``column`` or the first (ScenarioError)."""
-    raw = read_texts(path)
+    raw = read_text_rows(path)
     stamp, node = find_column(raw, "t"), find_column(raw, "node") or find_column(raw, "sender")
     rest = [name for name in raw.columns if name not in (stamp, node)]
     if not stamp or not node or not rest:

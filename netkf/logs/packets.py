@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from netkf.core.csv_files import is_number, open_table
+from netkf.core.csv_files import is_number_text, open_table
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import SourceFile
 from netkf.core.printable import count_phrase
@@ -76,7 +76,7 @@ class PacketLog:
     ticks: Path | None = None
 
 
-def read_texts(path: Path) -> pd.DataFrame:
+def read_text_rows(path: Path) -> pd.DataFrame:
     """Return a table as texts by line number, names in lower case; raises ScenarioError."""
     rows: list[list[str]] = []
     lines: list[int] = []
@@ -96,7 +96,7 @@ def read_texts(path: Path) -> pd.DataFrame:
         raise ScenarioError(str(path), error.rule, error.value, error.remedy) from None
     for wrong, rule, remedy in (
         (len(header) == 1, "must have several columns", "separate them by comma, semicolon or tab"),
-        (all(map(is_number, header)), "must name its columns", "write their names in line 1"),
+        (all(map(is_number_text, header)), "must name its columns", "write their names in line 1"),
     ):
         if wrong:
             raise ScenarioError(str(path), rule, header, remedy)

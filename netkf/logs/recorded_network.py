@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from netkf.core.csv_files import is_number
+from netkf.core.csv_files import is_number_text
 from netkf.core.errors import ScenarioError
 from netkf.core.printable import count_phrase
 from netkf.core.stamps import TimeBase
@@ -154,7 +154,7 @@ def rename_nodes(log: PacketLog, known: set[str]) -> None:
     if all(re.fullmatch(r"\d{1,15}", node) for node in nodes):
         names = {node: str(int(node)) for node in nodes}  # as tables write 01
     else:
-        names = {n: f"n{name}" if is_number(name) else name for n, name in names.items()}
+        names = {n: f"n{name}" if is_number_text(name) else name for n, name in names.items()}
     if len(set(names.values())) < len(nodes):
         names = {node: f"n{k}" for k, node in enumerate(nodes)}
     # A row that begins with # is a comment; of other names tables hold all.
@@ -198,7 +198,7 @@ def _own_scenario(
 ) -> Files:
     """Return a scenario with a plant and a filter to begin with, and the tables that it names."""
     sends, nodes = log.sends, sorted({*account["sender"], *account["receiver"]})
-    ids: list[Any] = [int(node) for node in nodes] if is_number(nodes[0]) else nodes
+    ids: list[Any] = [int(node) for node in nodes] if is_number_text(nodes[0]) else nodes
     ids = sorted(ids)
     sends = _sends_of(log, set(nodes), "that nobody ever heard")
     directed = bool((sends["to"] != "").any())

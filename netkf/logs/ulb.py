@@ -14,14 +14,14 @@ import pandas as pd
 
 from netkf.core.errors import ScenarioError
 from netkf.core.printable import count_phrase
-from netkf.logs.packet_tables import find_column, find_extra, read_positions, read_readings
+from netkf.logs.packet_tables import find_column, find_extra, read_log_positions, read_readings
 from netkf.logs.packets import (
     PacketLog,
     find_resolution,
     note_count,
     parse_numbers,
     parse_stamps,
-    read_texts,
+    read_text_rows,
     refuse_rows,
     spread_equal,
 )
@@ -82,13 +82,13 @@ def read_ulb(log: Path) -> PacketLog:
     result.readings = readings
     places = find_extra(log, "positions")
     if places is not None:
-        result.positions = read_positions(places, origin, notes)
+        result.positions = read_log_positions(places, origin, notes)
     return result
 
 
 def _read_named(path: Path, names: tuple[str, ...]) -> pd.DataFrame:
     """Return a table of texts that has the columns ``names``, motes among them in every row."""
-    table = read_texts(path)
+    table = read_text_rows(path)
     for name in names:
         column = find_column(table, name)
         if not column:

@@ -54,7 +54,7 @@ def to_xarray(result: Run | Ensemble) -> Any:
         text = to_toml({**resolve_defaults(scenario), "seed": result.seed})
         about = "the scenario, without the files that it names"
         variables["scenario"] = (), text, {"long_name": about}
-        coordinates |= _places(scenario, is_run)
+        coordinates |= _coordinates_of_nodes(scenario, is_run)
     if isinstance(result, Run):
         attributes |= {
             "replica": result.replica,
@@ -69,7 +69,7 @@ def to_xarray(result: Run | Ensemble) -> Any:
     return xarray.Dataset(variables, coordinates, attributes)
 
 
-def _places(scenario: Scenario, is_run: bool) -> Variables:
+def _coordinates_of_nodes(scenario: Scenario, is_run: bool) -> Variables:
     """Return coordinates of nodes that stay at one place and, of a run, the blocks of states."""
     found: Variables = {}
     points = scenario.topology.positions

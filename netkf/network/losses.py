@@ -532,12 +532,12 @@ class KernelLoss(Loss):
         messages = self.describe(sent)
         times = np.array(np.broadcast_to(sent.time, len(messages)), dtype=np.float64)
         out = np.empty((len(messages), 1))
-        fill_chances(*self.kernel_call(), messages, times, out)
+        fill_probabilities(*self.kernel_call(), messages, times, out)
         return out[:, 0] if np.ndim(sent.number) else float(out[0, 0])
 
 
 @kernel
-def fill_chances(
+def fill_probabilities(
     address: int, settings: FloatArray, messages: FloatArray, times: FloatArray, out: FloatArray
 ) -> None:
     """Write the delivery probabilities (K, 1) of ``messages`` (K, M) sent at ``times`` (K,)."""

@@ -139,7 +139,7 @@ class Layout:
 
     def __init__(self, blocks: Sequence[Block]) -> None:
         """Raises ScenarioError for names and nodes that occur twice."""
-        self.places: tuple[Place, ...] = tuple(_places(blocks))
+        self.places: tuple[Place, ...] = tuple(_lay_out(blocks))
         self.n = sum(place.n for place in self.places)
         self.names = tuple(dict.fromkeys(place.name for place in self.places))
         self._by_key = {(place.name, place.node): place for place in self.places}
@@ -181,7 +181,7 @@ class Layout:
         return whole
 
 
-def _places(blocks: Sequence[Block]) -> Iterator[Place]:
+def _lay_out(blocks: Sequence[Block]) -> Iterator[Place]:
     first, seen = 0, set[tuple[str, int | None]]()
     names = [block.name for block in blocks]
     for k, block in enumerate(blocks):

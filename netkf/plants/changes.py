@@ -18,7 +18,7 @@ FROM = "from"
 
 
 @dataclass(frozen=True, eq=False)
-class Change(Component):
+class PlantChange(Component):
     """From ``start`` on (seconds, ``from`` in files) its matrices hold; all others stay."""
 
     _written_keys: ClassVar[Mapping[str, str]] = {"start": FROM}
@@ -33,7 +33,7 @@ class Change(Component):
 
 
 @dataclass(frozen=True, eq=False)
-class DiffusionChange(Change):
+class DiffusionChange(PlantChange):
     """A change of ``A`` (n, n), ``B`` (n, m), or ``G`` (n, m) of the input."""
 
     A: FloatArray | None = field(square, default=None)
@@ -42,7 +42,7 @@ class DiffusionChange(Change):
 
 
 @dataclass(frozen=True, eq=False)
-class LinearChange(Change):
+class LinearChange(PlantChange):
     """A change of ``F`` (n, n), ``Q`` (n, n), or ``G`` (n, m) of the input."""
 
     F: FloatArray | None = field(square, default=None)
@@ -50,7 +50,7 @@ class LinearChange(Change):
     G: FloatArray | None = field(matrix, default=None)
 
 
-def schedule_of(cls: type[Change]) -> Rule:
+def schedule_of(cls: type[PlantChange]) -> Rule:
     """Return the rule for a list of changes of class ``cls``, or tables of them, in the order of
     their times.
     """
@@ -58,7 +58,7 @@ def schedule_of(cls: type[Change]) -> Rule:
     names = {FROM if name == "start" else name: name for name in fields}
     listed = ", ".join(names)
 
-    def convert_change(value: Any) -> Change:
+    def convert_change(value: Any) -> PlantChange:
         if isinstance(value, cls):
             return value
         if not isinstance(value, Mapping):
@@ -89,8 +89,8 @@ def schedule_of(cls: type[Change]) -> Rule:
     remedy = f"write {{ {FROM} = 10.0, {[*names][1]} = ... }}"
     entries = list_of(Rule("must be a table", convert_change, remedy, schema), "tables", 0)
 
-    def convert(value: Any) -> tuple[Change, ...]:
-        changes: tuple[Change, ...] = entries.convert(value)
+    def convert(value: Any) -> tuple[PlantChange, ...]:
+        changes: tuple[PlantChange, ...] = entries.convert(value)
         for k, change in enumerate(changes[1:]):
             if change.start <= changes[k].start:
                 rule = f"must be later than that of the entry before it, {changes[k].start:.15g}"
@@ -102,7 +102,7 @@ def schedule_of(cls: type[Change]) -> Rule:
 
 
 def matrices_of_pieces(
-    first: Mapping[str, Any], schedule: tuple[Change, ...]
+    first: Mapping[str, Any], schedule: tuple[PlantChange, ...]
 ) -> list[dict[str, Any]]:
     """Return the matrices by name of the piece before all changes, ``first``, and after each."""
     pieces = [dict(first)]

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.core.contracts import place_of_error
+from netkf.core.contracts import error_line
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import Component, Rule
 from netkf.linalg.arrays import FloatArray, block_diagonal
@@ -177,7 +177,7 @@ def _convert(value: Any) -> Any:
     try:
         part = value() if isinstance(value, type) else value
     except Exception as error:
-        place = place_of_error(error)
+        place = error_line(error)
         rule = f"could not be made ({type(error).__name__}: {error}{'; ' if place else ''}{place})"
         raise ScenarioError("", rule, name, "give it an __init__ without arguments") from error
     wanted = () if hasattr(part, "kernels") else ("f", "jacobian")

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from netkf.core.contracts import place_of_error
+from netkf.core.contracts import error_line
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import boolean, covariance, field, seconds
 from netkf.linalg.arrays import FloatArray
@@ -110,7 +110,7 @@ def _check_dynamics(plant: Any, functions: tuple[VectorFunction, VectorFunction]
         try:
             value = function(x, u, 0.0, 0.0)
         except Exception as error:
-            place = place_of_error(error)
+            place = error_line(error)
             rule = f"{name} failed at plant.mean ({type(error).__name__}: {error}"
             rule = " ".join(f"{rule}{'; ' if place else ''}{place})".split())
             remedy = f"{name}(x, u, t) takes x ({n},), u ({m},) and t in seconds"

@@ -193,7 +193,7 @@ class RelativePositionSensor(PositionedSensor):
         for own, other in pairs:
             places.setdefault(own.node, []).append((own, other))
         groups = [[pair] for pair in pairs] if self.record is None else list(places.values())
-        return [self._of_places(group) for group in groups]
+        return [self._of_pairs(group) for group in groups]
 
     def check_block(self, n: int) -> None:
         """Raise ScenarioError if states, heading or R do not fit a block of ``n`` components."""
@@ -202,7 +202,7 @@ class RelativePositionSensor(PositionedSensor):
         object.__setattr__(whole, "positions", np.zeros((len(whole.places), len(self.states))))
         PositionedSensor.check_state(whole, n)
 
-    def _of_places(self, group: list[tuple[Place, Place]]) -> RelativePositionSensor:
+    def _of_pairs(self, group: list[tuple[Place, Place]]) -> RelativePositionSensor:
         own, sensor = group[0][0], copy.copy(self)
         values = {
             "nodes": (own.node,),

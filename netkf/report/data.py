@@ -102,7 +102,7 @@ def _facts(source: ReportSource, run: StoredRun) -> dict[str, Any]:
         "name": source.scenario.name,
         "status": source.status,
         "replica": run.replica,
-        "words": source.replicas.words(run.replica) if source.replicas else "",
+        "words": source.replicas.describe(run.replica) if source.replicas else "",
         "horizon": float(source.scenario.horizon),
         "truth": run.truth_known,
         # In slots, messages that a node sends at the same time are one transmission.

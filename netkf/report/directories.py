@@ -77,7 +77,7 @@ class ReportSource:
         """Return the worst and the median recorded run of an ensemble, unless shown."""
         if self.ensemble is None or self.run is None or self.replicas is None:
             return []
-        numbers = {int(self.replicas.numbers[self.replicas.place(rank)]) for rank in RANKS}
+        numbers = {int(self.replicas.numbers[self.replicas.index_of_rank(rank)]) for rank in RANKS}
         others = sorted(numbers - {self.run.replica})
         return [replace(self, run=self.ensemble.replica(number)) for number in others]
 

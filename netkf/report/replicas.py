@@ -34,20 +34,20 @@ class Replicas(NamedTuple):
     errors: FloatArray
     spread: FloatArray
 
-    def words(self, number: int) -> str:
+    def describe(self, number: int) -> str:
         """Return a replica with its rank, if it has one, and its error."""
-        place = self.place_of(number)
+        place = self.index_of(number)
         if place is None:
             return f"replica {number}"
-        ranks = "".join(f"{rank}, " for rank in RANKS if self.place(rank) == place)
+        ranks = "".join(f"{rank}, " for rank in RANKS if self.index_of_rank(rank) == place)
         error = format_number(float(self.errors[place]))
         return f"replica {number} ({ranks}RMS error {error})"
 
-    def place(self, rank: str) -> int:
+    def index_of_rank(self, rank: str) -> int:
         """Return the place in ``numbers`` of a rank, ``worst`` or ``median``."""
         return len(self.numbers) - 1 if rank == "worst" else (len(self.numbers) - 1) // 2
 
-    def place_of(self, number: int) -> int | None:
+    def index_of(self, number: int) -> int | None:
         """Return the place in ``numbers`` of a replica, None if it was not recorded."""
         return next(iter(np.flatnonzero(self.numbers == number).tolist()), None)
 
@@ -82,7 +82,7 @@ def choose_replica(
     if found is None:
         where, rule = shorten(Path(stored.directory)), "has not kept the errors of several runs"
         raise ScenarioError(where, rule, None, "run it with --trace full")
-    return int(found.numbers[found.place(replica)])
+    return int(found.numbers[found.index_of_rank(replica)])
 
 
 def describe_replica(shown: int, runs: int, replicas: Replicas | None) -> str:
@@ -90,13 +90,13 @@ def describe_replica(shown: int, runs: int, replicas: Replicas | None) -> str:
     sentence = f"The run that moves below is replica {shown} of {runs:,}"
     if replicas is None:
         return f"{sentence}; its trace is what was kept (--trace full keeps all)"
-    place = replicas.place_of(shown)
+    place = replicas.index_of(shown)
     if place is not None:
         sentence += f", RMS error {format_number(float(replicas.errors[place]))}, number "
         sentence += f"{place + 1} from the best"
     ends = [
         f"{rank} is {replicas.numbers[k]} ({format_number(float(replicas.errors[k]))})"
-        for rank, k in ((rank, replicas.place(rank)) for rank in RANKS)
+        for rank, k in ((rank, replicas.index_of_rank(rank)) for rank in RANKS)
     ]
     return (
         f"{sentence}. Of {len(replicas.numbers):,} recorded runs the {', the '.join(ends)}: choose "

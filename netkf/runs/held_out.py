@@ -10,7 +10,7 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.files import require_run
-from netkf.runs.readings import Readings, collect_readings
+from netkf.runs.readings import RunReadings, collect_readings
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
 
@@ -54,7 +54,7 @@ def errors_of_replica(scenario: Scenario, seed: int, replica: int) -> list[dict[
 
 
 def _errors(
-    scenario: Scenario, got: Readings
+    scenario: Scenario, got: RunReadings
 ) -> Iterator[tuple[int, FloatArray, FloatArray, FloatArray]]:
     """Yield the node of each reading, its error (p,), the covariance that it claims, and R."""
     run: Any = got.run

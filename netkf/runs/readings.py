@@ -38,7 +38,7 @@ class SensorReading(NamedTuple):
     rows: np.ndarray
 
 
-class Readings(NamedTuple):
+class RunReadings(NamedTuple):
     """The instants (K,) of readings in seconds, and these in order of time and node.
 
     run    : the run with samples at ``times``; None if all readings are recorded and none was asked
@@ -61,7 +61,7 @@ def collect_readings(
     simulated: bool = False,
     all_slots: bool = False,
     engine: str = "auto",
-) -> Readings:
+) -> RunReadings:
     """Return what the ``placed`` sensors of nodes that are up read in a ``replica`` after time 0;
     ``simulated`` by an ``engine`` too if readings are drawn. Raises ScenarioError and EngineError.
     """
@@ -98,7 +98,7 @@ def collect_readings(
             at = scenario.time_grid.snap(times + _sensing_delay(scenario))
             readings += (r for r in of_sensor if not _is_down(down, node, float(at[r.number])))
     readings.sort(key=lambda one: one.number)
-    return Readings(times, readings, run, origin)
+    return RunReadings(times, readings, run, origin)
 
 
 def _sensing_delay(scenario: Scenario) -> float:

@@ -143,7 +143,7 @@ def _of_blocks(sensor: Any, layout: Layout, topology: Topology) -> Iterator[Any]
         with errors_under("of"):
             nodes.setdefault(layout.require(name, node), []).append(node)
     for place, readers in nodes.items():
-        yield _at_place(sensor, place, tuple(readers), layout)
+        yield _for_block(sensor, place, tuple(readers), layout)
 
 
 def _name_of(sensor: Any, layout: Layout) -> str | None:
@@ -161,7 +161,7 @@ def _name_of(sensor: Any, layout: Layout) -> str | None:
     return layout.names[0]
 
 
-def _at_place(sensor: Any, place: Place, nodes: tuple[int, ...], layout: Layout) -> Any:
+def _for_block(sensor: Any, place: Place, nodes: tuple[int, ...], layout: Layout) -> Any:
     """Return a sensor of a block as one of the stacked state, on ``nodes`` alone."""
     if isinstance(sensor, PositionedSensor):
         largest = max(*sensor.states, sensor.heading or 0)

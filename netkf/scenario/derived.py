@@ -159,11 +159,14 @@ class DerivedScenario(ScenarioModel):
         """The ``believed_pieces`` of what each node estimates; once if all estimate all."""
         nodes = range(1 if self.views is None else len(self.nodes))
         return tuple(
-            tuple((self.seen_part(k, F), self.seen_part(k, Q)) for F, Q in self.believed_pieces)
+            tuple(
+                (self.estimated_part(k, F), self.estimated_part(k, Q))
+                for F, Q in self.believed_pieces
+            )
             for k in nodes
         )
 
-    def seen_part(self, k: int, M: FloatArray) -> FloatArray:
+    def estimated_part(self, k: int, M: FloatArray) -> FloatArray:
         """Return the rows and columns (n', n') of M (n, n) that node number ``k`` estimates."""
         return _part(M, self.view(k))
 
@@ -356,11 +359,11 @@ class DerivedScenario(ScenarioModel):
         sampled = self.placed_sensors if self.slotted else self.sampled_sensors
         counts = Counter(itertools.chain.from_iterable(self.estimated)) if self.plants else None
         whole = self.layout.places if self.node_filter.needs.coupled else ()
-        places = dict(zip(self.nodes, map(self._own_places, range(len(self.nodes))), strict=True))
+        places = dict(zip(self.nodes, map(self._own_blocks, range(len(self.nodes))), strict=True))
         return tuple(
             NodeInfo(
                 node, degrees[node], len(receivers(node)), len(self.nodes), own_weights[node],
-                self.seen_part(k, total_information), max_delay, k, senders(node), network,
+                self.estimated_part(k, total_information), max_delay, k, senders(node), network,
                 most_rows,
                 self._own_sensors(k, sampled.get(node, ())), places[node],
                 self._is_alone(k, counts), whole,
@@ -375,7 +378,7 @@ class DerivedScenario(ScenarioModel):
             return len(self.nodes) == 1
         return all(counts[place] == 1 for place in self.estimated[k])
 
-    def _own_places(self, k: int) -> tuple[Place, ...]:
+    def _own_blocks(self, k: int) -> tuple[Place, ...]:
         """Return the blocks of node number ``k`` at their places in its own state."""
         places, first = [], 0
         for place in self.estimated[k] if self.plants else ():
@@ -412,7 +415,7 @@ class DerivedScenario(ScenarioModel):
             senders[receiver].append(self.topology.index[sender])
         sender_indices = tuple(tuple(sorted(senders[node])) for node in self.nodes)
         # Such filters estimate one state at all nodes.
-        informations = np.stack([self.seen_part(0, G) for G in self.informations])
+        informations = np.stack([self.estimated_part(0, G) for G in self.informations])
         return NetworkInfo(informations, sender_indices)
 
     @cached_property

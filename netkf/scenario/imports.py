@@ -21,7 +21,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from netkf.core.contracts import ContractError, place_of_error
+from netkf.core.contracts import ContractError, error_line
 from netkf.core.errors import ScenarioError, quote
 from netkf.core.stamps import TimeBase
 
@@ -150,7 +150,7 @@ def _import_error(kind: str, error: BaseException) -> ScenarioError:
     is_missing = isinstance(error, ModuleNotFoundError) and error.name == kind.partition(":")[0]
     remedy = "put the module beside the scenario file or on the Python path"
     if not is_missing:
-        place = place_of_error(error)
+        place = error_line(error)
         remedy = f"correct the module, {place}" if place else "correct the module"
     return ScenarioError("kind", rule, kind, remedy)
 

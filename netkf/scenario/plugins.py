@@ -13,7 +13,7 @@ from pathlib import Path
 from types import CodeType, FrameType, FunctionType
 from typing import Any
 
-from netkf.core.contracts import ContractError, is_netkf_class, last_call, place_of, place_of_error
+from netkf.core.contracts import ContractError, error_line, is_netkf_class, last_call, source_line
 from netkf.core.errors import NetkfError, quote
 from netkf.core.fields import Component, walk
 from netkf.plants.dynamics import CustomDynamics
@@ -109,13 +109,13 @@ def explain_user_error(scenario: Any, error: Exception) -> str | None:
             found = (*found[:2], frame, line)
     if found is not None:
         cls, name, frame, line = found
-        return f"{_name_of(cls)} failed in {name}: {text}; {place_of(frame.f_code, line)}"
+        return f"{_name_of(cls)} failed in {name}: {text}; {source_line(frame.f_code, line)}"
     if isinstance(error, ContractError):
         return f"{_name_of(type(components[0]))}: {error}"
     call = last_call()
     if call is None or not any(isinstance(part, call.cls) for part in components):
         return f"{_name_of(type(components[0]))} failed: {text}"
-    where = f"{call.function.__name__} ({place_of(call.function.__code__)})"
+    where = f"{call.function.__name__} ({source_line(call.function.__code__)})"
     return f"{_name_of(call.cls)} failed after {where} returned {quote(call.result)}: {text}"
 
 
@@ -165,7 +165,7 @@ def describe_failure(error: BaseException) -> str:
     """Return what an exception of a user's class says, with its file and line, on one line."""
     if isinstance(error, ContractError):
         return str(error)
-    place = place_of_error(error)
+    place = error_line(error)
     return f"failed with {describe_error(error)}" + (f" ({place})" if place else "")
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from netkf.algorithms.gates import Gate
-from netkf.core.contracts import ContractError, is_netkf_class, place_of_error
+from netkf.core.contracts import ContractError, error_line, is_netkf_class
 from netkf.core.errors import ScenarioError, errors_under, suggest_nearest
 from netkf.core.fields import Component, SourceFile, integer, source_file, walk
 from netkf.network.channels import Channel
@@ -253,7 +253,7 @@ def _construct(cls: type[Any], values: dict[str, Any]) -> Any:
         raise
     except Exception as error:
         # The user's class is this one, or one of the values, whose methods a check called.
-        place = place_of_error(error)
+        place = error_line(error)
         where = f"; {place}" if place else ""
         rule = f"{cls.__name__} could not be made ({describe_error(error)}{where})"
         if isinstance(error, ContractError):

@@ -101,7 +101,7 @@ class RunConsistency(NamedTuple):
 
 # Errors of a filter that is unstable grow until their squares overflow: the verdicts say so.
 @np.errstate(over="ignore", invalid="ignore")
-def run_consistency(
+def replica_consistency(
     scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto"
 ) -> RunConsistency:
     """Return the consistency of one ``replica`` of the runs of ``seed``; for ``replicate``."""
@@ -377,7 +377,7 @@ def consistency(
         raise ScenarioError("plant", rule, None, remedy)
     count = require_runs(runs, MIN_RUNS)
     confidence = number(above=0.0, below=1.0)("confidence", confidence)
-    task = partial(run_consistency, engine=choose_engine(engine, scenario))
+    task = partial(replica_consistency, engine=choose_engine(engine, scenario))
     pool = PoolOptions(workers, executor, scheduler)
     results = replicate(task, _without_horizon(scenario), count, seed, pool=pool)
     return judge_consistency(scenario, results, confidence)
@@ -396,7 +396,7 @@ def _without_horizon(scenario: Scenario) -> Scenario:
     return dataclasses.replace(scenario, probe=times) if any(over_end) else scenario
 
 
-@np.errstate(over="ignore", invalid="ignore")  # as in run_consistency
+@np.errstate(over="ignore", invalid="ignore")  # as in replica_consistency
 def judge_consistency(
     scenario: Scenario, runs: Sequence[RunConsistency], confidence: float
 ) -> Consistency:

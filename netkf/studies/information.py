@@ -215,7 +215,7 @@ def _swap_flow(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -
 
 
 @dataclass(frozen=True, eq=False)
-class Reach:
+class BackwardSearch:
     """The result of a backward search from one node at the end of a log, for budgets b = 0 .. B:
     numbers of messages of cost 1 (not used in the run) that a path may take.
 
@@ -250,7 +250,7 @@ class Reach:
         return None
 
 
-def search_back(flow: Flow, node: int, budget: int = 0) -> Reach:
+def search_back(flow: Flow, node: int, budget: int = 0) -> BackwardSearch:
     """Search from ``node`` (its id) at the end of the log backwards for the information that can
     have reached it, along used messages and at most ``budget`` others.
     """
@@ -271,7 +271,7 @@ def search_back(flow: Flow, node: int, budget: int = 0) -> Reach:
         for b in range(cost, budget + 1):
             if used < deadline[b - cost][target] and sent > deadline[b][origin]:
                 deadline[b][origin], via[b][origin] = sent, message
-    return Reach(flow, np.array(deadline), np.array(via))
+    return BackwardSearch(flow, np.array(deadline), np.array(via))
 
 
 class KeptReadings:
@@ -341,7 +341,7 @@ class Newest(NamedTuple):
 
 
 def newest_information(
-    reach: Reach, log: IntArray, readings: KeptReadings, budget: int
+    reach: BackwardSearch, log: IntArray, readings: KeptReadings, budget: int
 ) -> dict[int, Newest]:
     """Return the newest information of each node that can have reached that of ``reach``."""
     flow, newest = reach.flow, dict[int, Newest]()
@@ -368,7 +368,7 @@ def _age_key(reading: float, known: float) -> tuple[float, float]:
     )
 
 
-def route(reach: Reach, segment: int, budget: int) -> tuple[int, ...]:
+def route(reach: BackwardSearch, segment: int, budget: int) -> tuple[int, ...]:
     """Return the ids of the nodes on the way of information of ``segment`` to the node."""
     path: Iterable[int] = reach.messages_from(segment, budget)
     receivers = [int(reach.flow.messages.receiver[m]) for m in path]

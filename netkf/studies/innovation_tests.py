@@ -248,7 +248,7 @@ def _judge_node(
     nis, rows = recorded.nis[chosen], recorded.rows[chosen]
     freedom, mean = float(rows.sum()), float(nis.sum() / rows.sum())
     whitened = [recorded.whitened[i] for i in chosen]
-    places, are_told = _places(recorded, chosen)
+    places, are_told = _value_indices(recorded, chosen)
     flat, of = np.concatenate(whitened), np.concatenate(places)
     columns = [flat[of == c] for c in np.unique(of)]
     # Correlated readings count as fewer independent ones.
@@ -279,7 +279,7 @@ def _judge_node(
     )  # fmt: skip
 
 
-def _places(recorded: Innovations, chosen: np.ndarray) -> tuple[list[np.ndarray], bool]:
+def _value_indices(recorded: Innovations, chosen: np.ndarray) -> tuple[list[np.ndarray], bool]:
     """Return which value each of ``chosen`` readings is of, and True if the record tells it."""
     told = [recorded.components[i] for i in chosen] if recorded.components else [None]
     known = [one for one in told if one is not None]

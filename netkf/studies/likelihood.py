@@ -29,7 +29,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.small import add_matmul, matmul
 from netkf.plants.transitions import Transitions
-from netkf.runs.readings import Readings, collect_readings
+from netkf.runs.readings import RunReadings, collect_readings
 from netkf.runs.simulate import require_scenario
 from netkf.scenario.model import PlacedSensor
 from netkf.scenario.scenario import Scenario
@@ -131,7 +131,7 @@ class CentralModel:
             rule, remedy = "give readings too large for rounding to leave", "shorten the horizon"
             raise ScenarioError("sensors", f"{rule} their noise", largest, remedy)
 
-    def _lay_rows(self, scenario: Scenario, got: Readings) -> None:
+    def _lay_rows(self, scenario: Scenario, got: RunReadings) -> None:
         """Lay out scalar readings: those of a noise that is not diagonal are decorrelated."""
         index = {(v.entry, row): k for k, v in enumerate(self.variances) for row in v.rows}
         H, of, owners = [], [], []

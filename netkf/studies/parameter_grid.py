@@ -71,7 +71,7 @@ def _are_finite(*texts: str) -> bool:
         return False
 
 
-def check_grid(grid: Any) -> dict[str, list[Any]]:
+def values_of_grid(grid: Any) -> dict[str, list[Any]]:
     """Return the values of each key of a user's ``grid``; raises ScenarioError."""
     if not isinstance(grid, Mapping) or not grid:
         found = None if isinstance(grid, Mapping) else grid
@@ -133,7 +133,7 @@ class GridPoint(NamedTuple):
 
 def expand_grid(scenario: Scenario, grid: Mapping[str, Sequence[Any]]) -> list[GridPoint]:
     """Return all points of a grid, the last key fastest; raises ScenarioError."""
-    values = check_grid(grid)
+    values = values_of_grid(grid)
     points, rows = (
         [dict(zip(values, chosen, strict=True)) for chosen in itertools.product(*columns)]
         for columns in (values.values(), map(table_column, values.values()))

@@ -41,7 +41,7 @@ from netkf.studies.metrics import (
     square_root_of,
     worst_node,
 )
-from netkf.studies.parameter_grid import GridPoint, check_grid, expand_grid
+from netkf.studies.parameter_grid import GridPoint, expand_grid, values_of_grid
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -259,7 +259,7 @@ def _write_manifest(directory: Path, plan: SweepPlan, points_done: int, status: 
         "name": plan.base.name,
         "versions": versions(),
         "seed": plan.base.seed,
-        "vary": check_grid(plan.vary),
+        "vary": values_of_grid(plan.vary),
         "runs": {"wanted": plan.runs * len(plan.points), "done": plan.runs * points_done},
         "status": status,
     }

@@ -19,10 +19,10 @@ from netkf.studies.explanation import GOOD_ENOUGH, InformationSource, Missing, W
 from netkf.studies.information import (
     OUTCOMES,
     USED,
+    BackwardSearch,
     Flow,
     KeptReadings,
     Newest,
-    Reach,
     at_once,
     find_flow,
     match_messages,
@@ -199,7 +199,7 @@ class _Evidence:
         self._log = replayer.full_log if self.same_sends else replayer.log
         usable = full if self.same_sends else at_once(self.messages, self._log)
         self._flow: Flow = find_flow(self.scenario, self._log, usable, was_used)
-        self._reach: Reach = search_back(self._flow, node, max_missing)
+        self._reach: BackwardSearch = search_back(self._flow, node, max_missing)
         # The same search in the replay with all messages tells what the node could have had at
         # best.
         full_flow = find_flow(self.scenario, replayer.full_log, full)

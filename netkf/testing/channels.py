@@ -111,7 +111,7 @@ def _check_channel(part: Any, topology: Topology | None, seed: int) -> None:
     links = table_entries(Complete(nodes=4).build(seed=0) if topology is None else topology)
     if isinstance(part, Delay):
         _check_message_delays(watched, tuple(links))
-        _draw_alike(watched, "draw", "for each message", lambda random, _: _draw(watched, random))
+        _draw_equally(watched, "draw", "for each message", lambda random, _: _draw(watched, random))
         if part.is_random:
             _check_draws(watched)
         _check_delay_law(watched, tuple(links))
@@ -142,7 +142,7 @@ def table_entries(topology: Topology) -> dict[Link, float]:
     return {link: TABLE[k % len(TABLE)] for k, link in enumerate(topology.directions)}
 
 
-def _draw_alike(
+def _draw_equally(
     watched: WatchedPart, method: str, each: str, step: Callable[[RecordingGenerator, Any], Any]
 ) -> Calls:
     """Return the calls of a generator that every ``step``, after the one before, must make."""
@@ -259,7 +259,7 @@ def _check_channel_state(watched: WatchedPart) -> None:
         watched.demand(method, bad is True or bad is False, "must be True or False", bad)
         return bad
 
-    calls = _draw_alike(watched, method, "at each activation", step)
+    calls = _draw_equally(watched, method, "at each activation", step)
     rule, remedy = "must draw nothing where stateful is False", "let stateful be True"
     is_silent = watched.part.stateful or not calls
     watched.demand(method, is_silent, rule, describe_calls(calls), remedy)

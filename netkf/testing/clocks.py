@@ -15,7 +15,7 @@ from netkf.core.clock import ClockPosition, Entity, generate_ticks
 from netkf.core.errors import ScenarioError
 from netkf.core.laws import EXPONENTIAL, Lattice
 from netkf.laws import stack_runs
-from netkf.laws.intervals import Comparison
+from netkf.laws.intervals import LawComparison
 from netkf.laws.noise import compare_correlations
 from netkf.laws.stating import stated_law, stating_class
 from netkf.laws.ticks import (
@@ -264,7 +264,7 @@ def _check_rates(
         distances += list(zip(singles, group.labels, strict=True))
     rule = "must be the mean ticks per second in the long run"
     remedy = "define mean_rate if links differ by design" if unknown.any() else ""
-    comparison = Comparison(distances, "ticks over the stated number")
+    comparison = LawComparison(distances, "ticks over the stated number")
     demand_agreement(comparison, f"{watched.name}.mean_rate", rule, remedy)
 
 
@@ -292,7 +292,7 @@ def _check_gaps(
         demand_agreement(comparison, where, rule, remedy)
 
 
-def _compare_gaps_of_links(group: ClockGroup, times: list[list[FloatArray]]) -> Comparison:
+def _compare_gaps_of_links(group: ClockGroup, times: list[list[FloatArray]]) -> LawComparison:
     """Compare correlations between the first GAPS gaps of Poisson clocks, made normal, with 0."""
     z = np.full((len(times), GAPS, len(group.rates)), np.nan)
     for run, one in enumerate(times):

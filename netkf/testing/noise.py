@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.laws.intervals import Comparison
+from netkf.laws.intervals import LawComparison
 from netkf.laws.noise import (
     PARTS,
     compare_entries,
@@ -39,7 +39,7 @@ def family_level() -> float:
     return LEVEL / FAMILIES
 
 
-def demand_agreement(comparison: Comparison, where: str, rule: str, remedy: str = "") -> None:
+def demand_agreement(comparison: LawComparison, where: str, rule: str, remedy: str = "") -> None:
     """Raise AssertionError ``where: rule; got ...; remedy`` if draws differ from their law."""
     if comparison.worst is not None:
         found, label = comparison.worst

@@ -21,7 +21,7 @@ UNEQUAL = np.array([[0.5, 0.3, 0.2], [0.2, 0.5, 0.3], [0.3, 0.2, 0.5]])
 """Weights of three nodes whose rows and columns sum to 1, and are not the same."""
 
 
-class Difference(NamedTuple):
+class EstimateDifference(NamedTuple):
     """A difference of estimates from those of the parent.
 
     relative : difference divided by the size of the quantity
@@ -85,9 +85,9 @@ def _forbid_transposed(name: str, child: WatchedPart, parent: WatchedPart) -> No
         fail(f"{name}.weights", rule, "the weights that node l gives to node i", remedy)
 
 
-def largest_difference(child: WatchedPart, parent: WatchedPart) -> Difference | None:
+def largest_difference(child: WatchedPart, parent: WatchedPart) -> EstimateDifference | None:
     """Return the largest relative difference of two filters' estimates, or None."""
-    found: list[Difference] = []
+    found: list[EstimateDifference] = []
     # Where all nodes hear the same, weights of estimates show only if these differ at first.
     spread = 1.0 if isinstance(getattr(child.part, "weights", None), np.ndarray) else 0.0
     for system, kind in setups(child.part, parent.part):
@@ -103,10 +103,12 @@ def largest_difference(child: WatchedPart, parent: WatchedPart) -> Difference | 
     return max(found, key=lambda one: one.relative, default=None)
 
 
-def _difference(quantity: str, one: FloatArray, other: FloatArray, unit: str) -> Difference:
+def _difference(quantity: str, one: FloatArray, other: FloatArray, unit: str) -> EstimateDifference:
     """Return the largest difference of estimates (T, N, ...), 0 where they are nan."""
     rest = tuple(range(2, one.ndim))
     size = 1.0 + np.abs(one).max(axis=rest) + (np.abs(other).max(axis=rest) if one.ndim < 4 else 0)
     relative = np.nan_to_num(np.abs(one - other).max(axis=rest) / size)
     k, node = np.unravel_index(int(np.argmax(relative)), relative.shape)
-    return Difference(float(relative[k, node]), quantity, f"at node {node} after {unit} {k}")
+    return EstimateDifference(
+        float(relative[k, node]), quantity, f"at node {node} after {unit} {k}"
+    )

@@ -10,7 +10,7 @@ import numpy as np
 
 from netkf.checks.parts.noises import Pieces, read_pieces
 from netkf.core.clock import Clock
-from netkf.laws.intervals import Comparison
+from netkf.laws.intervals import LawComparison
 from netkf.laws.noise import whiten
 from netkf.laws.ticks import count_interval
 from netkf.linalg.arrays import FloatArray
@@ -366,7 +366,7 @@ def _check_times(sensor: Any, where: str, nodes: tuple[int, ...], seed: int) -> 
         # The phase of a clock may add or remove one tick in each run.
         level, values = family_level(), np.array(counts)
         distance = count_interval(values, EXPECTED_SAMPLES, level, False, 1.0)
-        comparison = Comparison([(distance, "all nodes")], "samples over the stated number")
+        comparison = LawComparison([(distance, "all nodes")], "samples over the stated number")
         demand_agreement(comparison, where, "must be as many as the mean rate of `sampling` states")
     for node in nodes:
         ends = (horizon, 0.4 * horizon, horizon)

@@ -64,7 +64,7 @@ def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> Flo
     """
     joint = _joint_moments(scenario, run, about_mean=True)
     if not stacked:
-        return _seen_blocks(scenario, joint)
+        return _estimated_blocks(scenario, joint)
     if scenario.views is None:
         return joint
     known = scenario.is_estimated.ravel()
@@ -75,7 +75,7 @@ def error_squares(scenario: Scenario, run: Run) -> FloatArray:
     """Return E[(x - xhat_i)(x - xhat_i)'] (T, N, n, n) given the events: :func:`error_covariance`
     and the square of the mean error. Raises its errors.
     """
-    return _seen_blocks(scenario, _joint_moments(scenario, run, about_mean=False))
+    return _estimated_blocks(scenario, _joint_moments(scenario, run, about_mean=False))
 
 
 @IGNORED
@@ -98,7 +98,7 @@ def diagonal_blocks(stacked: FloatArray, nodes: int) -> FloatArray:
     return np.ascontiguousarray(np.einsum("tiaib->tiab", blocks))
 
 
-def _seen_blocks(scenario: Scenario, joint: FloatArray) -> FloatArray:
+def _estimated_blocks(scenario: Scenario, joint: FloatArray) -> FloatArray:
     """Return the blocks (T, N, n, n), nan beyond the states of a node, of joint (T, N n, N n)."""
     known = scenario.is_estimated
     blocks = diagonal_blocks(joint, len(scenario.nodes))

@@ -126,7 +126,7 @@ OF_PAPERS = {
     "block_cross_covariances": PaperTheory(slot_conditions=_pair_rows, weight_rows=_pair_rows),
     "consensus_innovations": PaperTheory(slot_conditions=_pseudo_state_rows),
     "constant_gain": PaperTheory(
-        slot_jumps=constant_gains.slot_jumps, clock_jumps=constant_gains.clock_jumps
+        slot_jumps=constant_gains.constant_gain_jumps, clock_jumps=constant_gains.clock_jumps
     ),
     "diffusion": PaperTheory(diffusion.slot_rows),
     "event_triggered": PaperTheory(slot_conditions=_event_rows),
@@ -134,7 +134,7 @@ OF_PAPERS = {
     "hybrid": PaperTheory(weight_rows=_reset_rows),
     "information_consensus": PaperTheory(information_consensus.slot_rows),
     "intermittent": PaperTheory(intermittent.slot_rows),
-    "kalman_consensus": PaperTheory(slot_jumps=kalman_consensus.slot_jumps),
+    "kalman_consensus": PaperTheory(slot_jumps=kalman_consensus.consensus_jumps),
     "push_sum": PaperTheory(push_sum.slot_rows, slot_promises=slot_promises, slot_lines=slot_lines),
     "stochastic_trigger": PaperTheory(slot_conditions=_silence_rows, error_columns=error_columns),
     "track_fusion": PaperTheory(_track_rows, steady_slots=tracks_in_slots),

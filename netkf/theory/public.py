@@ -1,7 +1,7 @@
 """The public functions of ``netkf.theory``, which imports them when the first is used."""
 
 from netkf.theory.assumption_rows import assumptions
-from netkf.theory.common.requirements import require_scenario
+from netkf.theory.common.requirements import guard_functions
 from netkf.theory.diffusion.information import TrackingLevel, information_level, tracking_level
 from netkf.theory.errors import error_covariance
 from netkf.theory.gossip.invariant import SwitchedSamples, switched_samples
@@ -109,4 +109,4 @@ __all__ = [
 
 # Every function whose first parameter is a scenario refuses anything else with one error message.
 _FUNCTIONS = {name: globals()[name] for name in __all__}
-PUBLIC = _FUNCTIONS | require_scenario(_FUNCTIONS)
+PUBLIC = _FUNCTIONS | guard_functions(_FUNCTIONS)

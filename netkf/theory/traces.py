@@ -31,7 +31,7 @@ MAX_STEADY_ENTRIES = 100_000
 """Largest number of entries of all covariances for which a run computes the steady state."""
 
 
-def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
+def theory_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
     """Return traces at ``times``: bound on P, its limit, a central filter's; or the reason."""
     bound, reached, reason = None, None, ""
     try:

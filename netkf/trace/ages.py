@@ -190,7 +190,7 @@ def renew(s: AgeState, i: int, c: int, value: float, t: float) -> None:
 
 
 @kernel
-def take(s: AgeState, link: int, number: int) -> int:
+def find_message(s: AgeState, link: int, number: int) -> int:
     """Return the message of this ``number`` from the list of a ``link``, -1 if there is none."""
     before, k = -1, s.under_way[link]
     while k >= 0 and s.number[k] != number:
@@ -204,14 +204,14 @@ def take(s: AgeState, link: int, number: int) -> int:
 
 
 @kernel
-def release(s: AgeState, k: int) -> None:
+def replace_message(s: AgeState, k: int) -> None:
     """Make room for another message in the place of message ``k``."""
     s.free[s.free[-1]] = k
     s.free[-1] += 1
 
 
 @kernel
-def tell(s: AgeState, i: int, k: int, t: float, tells_all: bool) -> None:
+def fill_message(s: AgeState, i: int, k: int, t: float, tells_all: bool) -> None:
     """Let message ``k`` hold what node ``i`` knows at ``t``, or of its own reading only."""
     own = s.own[i]
     for c in range(s.newest.shape[1]):
@@ -225,13 +225,13 @@ def clear(s: AgeState, i: int) -> None:
     """Let no message wait for node ``i``."""
     k = s.inbox[i]
     while k >= 0:
-        release(s, k)
+        replace_message(s, k)
         k = s.following[k]
     s.inbox[i] = -1
 
 
 @kernel
-def use(s: AgeState, i: int, t: float) -> None:
+def use_waiting(s: AgeState, i: int, t: float) -> None:
     """Let node ``i`` use the messages that wait for it: all, or in a swap the newest one of the
     last sender, which replaces all that it knows.
     """
@@ -272,15 +272,15 @@ def follow(
             k = s.free[s.free[-1]]
             s.number[k], s.sender[k] = number[e], i
             s.following[k], s.under_way[link[e]] = s.under_way[link[e]], k
-            tell(s, i, k, t, tells_all[e])
+            fill_message(s, i, k, t, tells_all[e])
         elif action[e] == DROP or action[e] == DELIVER:
-            k = take(s, link[e], number[e])
+            k = find_message(s, link[e], number[e])
             if k >= 0 and action[e] == DROP:
-                release(s, k)
+                replace_message(s, k)
             elif k >= 0:
                 s.following[k], s.inbox[i] = s.inbox[i], k
         elif action[e] == USE:
-            use(s, i, t)
+            use_waiting(s, i, t)
         elif action[e] == SENSE:
             renew(s, i, s.own[i], t, t)
         elif action[e] == STOP or action[e] == FORGET:

@@ -8,7 +8,7 @@ import scipy.linalg
 from netkf.algorithms.filter import Estimate, Exchange, Increments, Message, NodeInfo
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.kernels.gains import gain_table, longest_interval
-from netkf.algorithms.kernels.riccati import move_covariances, riccati_flow
+from netkf.algorithms.kernels.riccati import flow_covariance, move_covariances
 from netkf.algorithms.kernels.root_flow import gain_update_root
 from netkf.algorithms.models import FlowModel
 from tests import reference
@@ -31,7 +31,7 @@ def test_gains_are_the_projections_of_the_exact_weight(seed):
     A, Q, H, R, P0 = system(seed)
     g, G = 0.05, H.T @ np.linalg.solve(R, H)
     model = FlowModel(A, Q, H, R, 1.0, g)
-    flow = lambda s: move_covariances(riccati_flow(A, Q, G, s), P0)  # noqa: E731
+    flow = lambda s: move_covariances(flow_covariance(A, Q, G, s), P0)  # noqa: E731
 
     def change(t, Phi):
         return ((A - flow(t) @ G) @ Phi.reshape(3, 3)).reshape(-1)

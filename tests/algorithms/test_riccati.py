@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import netkf
-from netkf.algorithms.kernels.riccati import move_covariances, riccati_flow
+from netkf.algorithms.kernels.riccati import flow_covariance, move_covariances
 from tests import reference
 
 WALK = np.array([[0.0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 0, 0]])
@@ -64,7 +64,7 @@ def test_the_kernel_is_the_formula(seed, n, reads):
             triple = reference.flow_triple(*reference.exactly(A, Q, G), gap)
             exact, _ = reference.flow(*reference.exactly(P, np.zeros(n)), triple)
         expected = reference.rounded(exact)
-        found = move_covariances(riccati_flow(A, Q, G, gap), P)
+        found = move_covariances(flow_covariance(A, Q, G, gap), P)
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
 
 
@@ -76,7 +76,7 @@ def test_flow_composes_over_gaps_and_keeps_covariances(seed, n, first, second):
     A = random.normal(size=(n, n))
     B, C, S = (random.normal(size=(n, 2)) for _ in range(3))
     Q, G, P = B @ B.T, C @ C.T, S @ S.T
-    both, *parts = (riccati_flow(A, Q, G, gap) for gap in (first + second, first, second))
+    both, *parts = (flow_covariance(A, Q, G, gap) for gap in (first + second, first, second))
     once, twice = move_covariances(both, P), P
     for part in parts:
         twice = move_covariances(part, twice)
@@ -93,8 +93,10 @@ def test_flows_reach_as_far_as_numbers_do():
     G = np.array([[0.4484587754453364, -0.8405481755376778], [0.0, 1.5754429929442604]])
     G[1, 0] = G[0, 1]
     A = 60.0 * np.eye(2)
-    assert not np.isfinite(move_covariances(riccati_flow(A, Q, 0.0 * G, 2000.0), np.eye(2))).any()
-    P = move_covariances(riccati_flow(A, Q, G, 0.05), np.eye(2))
+    assert not np.isfinite(
+        move_covariances(flow_covariance(A, Q, 0.0 * G, 2000.0), np.eye(2))
+    ).any()
+    P = move_covariances(flow_covariance(A, Q, G, 0.05), np.eye(2))
     np.testing.assert_allclose(P, exact(np.eye(2), A, Q, G, 0.05), rtol=1e-9)
 
 

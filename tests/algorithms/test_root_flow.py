@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy
 
-from netkf.algorithms.kernels.riccati import move_covariances, riccati_flow
+from netkf.algorithms.kernels.riccati import flow_covariance, move_covariances
 from netkf.algorithms.kernels.root_flow import (
     flow_root,
     flow_scratch,
@@ -187,7 +187,7 @@ def test_agrees_with_the_flow_of_covariances_at_ordinary_scales(p, gap):
         H, R = random.normal(size=(p, n)), np.eye(p) + 0.1
         G = H.T @ np.linalg.solve(R, H)
         root, x = np.linalg.cholesky(np.eye(n) + 0.5), random.normal(size=n)
-        P = move_covariances(riccati_flow(A, Q, G, gap), root @ root.T)
+        P = move_covariances(flow_covariance(A, Q, G, gap), root @ root.T)
         mean = scipy.linalg.expm(A * gap) @ x
         made, moved = flow_root(flow_table(A, Q, H, R, LONGEST), root, x, gap)
         assert distance(made, P) < 1e-11

@@ -11,7 +11,7 @@ from netkf.algorithms.models import FlowModel
 from netkf.checks.innovations import ExpectedIncrements, autocorrelation, compute_innovations
 from netkf.figures.panels import MAX_FREEDOM, nees_interval
 from netkf.figures.traffic import age_of_information, heard, messages_by_direction, wilson_interval
-from netkf.studies.consistency import run_consistency
+from netkf.studies.consistency import replica_consistency
 from netkf.trace.messages import join_messages
 from netkf.trace.schema import rows_of
 from tests.conftest import SCENARIOS
@@ -127,7 +127,7 @@ def test_increments_are_as_far_from_expectations_as_exact_covariances_say(believ
 def test_innovations_of_slots_have_the_nis_of_netkf_consistency():
     scenario = netkf.load(SCENARIOS / "diffusion_regression.toml", {"horizon": 40.0, "probe": 1.0})
     found = compute_innovations(netkf.simulate(scenario))
-    expected = run_consistency(scenario, scenario.seed, 0).nis
+    expected = replica_consistency(scenario, scenario.seed, 0).nis
     for node, nis in zip(scenario.nodes, expected, strict=True):
         mine = found.nis[(found.nodes == node) & (found.times > 0.0)]
         np.testing.assert_allclose(mine.mean(), nis, rtol=0.05)  # the last slot is one's alone

@@ -11,11 +11,11 @@ import scipy.optimize
 import netkf
 from netkf.cli.main import main
 from netkf.core.errors import ScenarioError
-from netkf.logs.envelope import Law
+from netkf.logs.envelope import FittedLaw
 from netkf.logs.fitting import run_tests
 from netkf.logs.outcomes import (
     Group,
-    Outcomes,
+    LogOutcomes,
     binomial_interval,
     counts_in,
     fit_chain,
@@ -54,7 +54,7 @@ def drawn(
                 q[t] = np.where(state, bad, good)
         follows = np.arange(T) > 0
         groups.append(Group((uniform < q).astype(float), np.arange(T) + s / 9, follows, ids))
-    return Outcomes(tuple(links), tuple(groups), ("",) * senders)
+    return LogOutcomes(tuple(links), tuple(groups), ("",) * senders)
 
 
 def seeds(count, offset=0):
@@ -234,7 +234,7 @@ def test_the_distance_when_nodes_move(tmp_path):
 
 def test_runs_draw_parameters_from_their_posterior():
     """Beta(heard + 1/2, lost + 1/2): ten packets leave a spread that mean and variance tell."""
-    law = Law("per-link", np.array([0.7]), 0.0, np.array([[10.0, 7.0]]))
+    law = FittedLaw("per-link", np.array([0.7]), 0.0, np.array([[10.0, 7.0]]))
     values = np.array([law.draw(random)[0] for random in seeds(2000, 8)])
     a, b = 7.5, 3.5
     assert values.mean() == pytest.approx(a / (a + b), abs=0.01)

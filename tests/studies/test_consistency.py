@@ -20,7 +20,7 @@ from netkf.studies.consistency import (
     consistency,
     judge_consistency,
     judged_blocks,
-    run_consistency,
+    replica_consistency,
 )
 from netkf.studies.innovations import ClockedInnovations
 from netkf.studies.metrics import expected_metrics
@@ -125,7 +125,7 @@ def test_the_square_of_the_first_offset_is_in_what_nees_and_mean_squares_should_
         P, m = (1.0 - gain * H) * P, (1.0 - gain * H) * m
         squares.append(P + m**2)
         expected.append(1.0 + m**2 / P)
-    found = run_consistency(scenario, 1, 0)
+    found = replica_consistency(scenario, 1, 0)
     assert found.expected[0] == pytest.approx(np.mean(expected), rel=1e-9)
     exact = expected_metrics(scenario, 1, 0, "simpy")
     assert exact.mean_square[0, 0] == pytest.approx(np.mean(squares[1:]), rel=1e-9)
@@ -160,7 +160,7 @@ def test_exact_covariances_of_large_networks_are_left_out_and_a_line_says_so(rin
 def test_nis_is_the_textbook_one(gossip):
     """Local filters: the prediction from the last sample against the reading, in plain numpy."""
     local = gossip.replace({"filter": {"kind": "local"}})
-    seen, run = run_consistency(local, 3, 2), netkf.simulate(local, seed=3, replica=2)
+    seen, run = replica_consistency(local, 3, 2), netkf.simulate(local, seed=3, replica=2)
     from netkf.rng.streams import Streams
 
     path = local.slot_path(Streams(3, 2), 0, local.placed_sensors[0][0])
@@ -298,7 +298,7 @@ def test_nis_under_clocks_is_that_of_samples(tmp_path):
     """Of a node alone by a plain Kalman filter; where P is exact its mean is that of chi-square."""
     lost = {"loss": {"kind": "bernoulli", "delivery": 0.0}}
     alone = load(CLOCKED, tmp_path, network__channel=lost)
-    seen, run = run_consistency(alone, 3, 2), netkf.simulate(alone, seed=3, replica=2)
+    seen, run = replica_consistency(alone, 3, 2), netkf.simulate(alone, seed=3, replica=2)
     path = alone.sample_path(Streams(3, 2), 1, alone.placed_sensors[1][0])
     F, values, x, P = np.exp(-0.1), [], 0.0, 1.0
     for k in range(1, 12):
@@ -314,11 +314,11 @@ def test_nis_under_clocks_is_that_of_samples(tmp_path):
     drawn = load(CLOCKED, tmp_path, filter=filtering, horizon=4.0, **late)
     # Two instants of an absolute reading and a relative one for each with a relative one alone.
     blocks = {(b.node, b.block): k for k, b in enumerate(judged_blocks(drawn))}
-    found = run_consistency(drawn, 3, 2)
+    found = replica_consistency(drawn, 3, 2)
     assert found.expected_nis[blocks[0, "pose@1"]] == pytest.approx((3 * 2 + 4) / 7)
     assert found.expected_nis[blocks[1, "pose@1"]] == pytest.approx(1.0)
     own = load(CLOCKED, tmp_path, filter__estimates="own+neighbours", horizon=4.0, **late)
-    found = run_consistency(own, 3, 2)
+    found = replica_consistency(own, 3, 2)
     assert np.isfinite(found.nis[blocks[2, "pose@3"]])
     assert found.expected_nis[blocks[2, "pose@3"]] <= 1.0 + 1e-9
 
@@ -340,14 +340,14 @@ def test_nodes_that_sample_at_times_of_their_own_have_innovations_each(ring, mon
             for block in judged_blocks(scenario)
         ]
         assert np.mean(numbers) == pytest.approx(count, rel=0.35)
-        assert np.isfinite(run_consistency(scenario, 3, 0).nis).all() == (count > 0.0)
+        assert np.isfinite(replica_consistency(scenario, 3, 0).nis).all() == (count > 0.0)
 
 
 def test_runs_in_which_a_node_reads_nothing_do_not_hide_its_innovations(ring):
     sampling = {"kind": "poisson", "rate": 0.4}
     sensors = [{"nodes": [0, 1, 2], "H": [[1.0, 0.0]], "R": [[0.2]], "sampling": sampling}]
     scenario = ring.replace({"sensors": sensors, "filter": {"kind": "local"}, "horizon": 5.0})
-    runs = [run_consistency(scenario, 1, replica) for replica in range(20)]
+    runs = [replica_consistency(scenario, 1, replica) for replica in range(20)]
     assert np.isnan([run.nis[:3] for run in runs]).any()
     found = judge_consistency(scenario, runs, 0.99)
     assert np.isfinite(found.table["nis"][:3]).all()

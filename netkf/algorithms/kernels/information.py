@@ -33,7 +33,7 @@ def clear_part(lanes: Lanes, part: FloatArray) -> None:
 
 
 @kernel(inlined=True)
-def copy_part(lanes: Lanes, source: FloatArray, target: FloatArray) -> None:
+def copy_information_root(lanes: Lanes, source: FloatArray, target: FloatArray) -> None:
     """Copy the root ``source`` (n, n + 1, L) to ``target``."""
     n = len(source)
     for i in range(n):

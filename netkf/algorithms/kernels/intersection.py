@@ -1,9 +1,9 @@
 """Kernels of covariance intersection, paper D (8) and (9) (Xie, Gan and Liu), on lanes.
 
-``P^-1 = sum w_j P_j^-1`` and ``P^-1 x = sum w_j P_j^-1 x_j``: ``invert_lanes`` and ``whiten`` make
-the terms, ``merge_lanes`` adds them, and ``finish_lanes`` writes P and x. Information is carried as
-a root too, ``P^-1 = Z' Z``. Diffusion, consensus on information, event-triggered consensus and
-belief propagation use these kernels.
+``P^-1 = sum w_j P_j^-1`` and ``P^-1 x = sum w_j P_j^-1 x_j``: ``invert_lanes`` and
+``write_information_root`` make the terms, ``merge_lanes`` adds them, and ``finish_lanes`` writes P
+and x. Information is carried as a root too, ``P^-1 = Z' Z``. Diffusion, consensus on information,
+event-triggered consensus and belief propagation use these kernels.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def invert_lanes(
 
 
 @kernel(inlined=True, fused=True)
-def whiten(
+def write_information_root(
     lanes: Lanes,
     size: Size,
     out: FloatArray,

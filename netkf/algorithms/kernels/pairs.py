@@ -51,7 +51,7 @@ class Pairs(Struct):
     slot: int
 
 
-def pairs_of(rows: NonlinearRows, own: int, first: IntArray) -> Pairs:
+def empty_pairs(rows: NonlinearRows, own: int, first: IntArray) -> Pairs:
     """Return pairs of nobody yet, for readings with these ``first`` ones."""
     K, p = rows.kind.shape
     return Pairs(
@@ -69,7 +69,7 @@ def pairs_of(rows: NonlinearRows, own: int, first: IntArray) -> Pairs:
 @cache
 def no_pairs() -> Pairs:
     """Return no pairs, for filters that know no blocks."""
-    return pairs_of(no_nonlinear(), 0, np.zeros(1, dtype=int))
+    return empty_pairs(no_nonlinear(), 0, np.zeros(1, dtype=int))
 
 
 @kernel

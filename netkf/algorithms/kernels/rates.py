@@ -81,7 +81,7 @@ class RateRun(Struct):
 
 
 @kernel
-def last_jump(times: FloatArray, time: float) -> int:
+def change_before(times: FloatArray, time: float) -> int:
     """Return the index of the last of increasing ``times`` (J,) not after ``time``, -1 without."""
     low, high = 0, len(times)
     while low < high:
@@ -96,7 +96,7 @@ def last_jump(times: FloatArray, time: float) -> int:
 @kernel
 def set_input(model: RateTables, time: float, middle: float) -> None:
     """Write the input at ``time`` into ``model.u``; it does not jump from there to ``middle``."""
-    last = last_jump(model.times, middle)
+    last = change_before(model.times, middle)
     for k in range(len(model.u)):
         model.u[k] = model.values[last, k] if last >= 0 else 0.0
         if not math.isnan(model.sine[0, k]):
@@ -151,7 +151,7 @@ def move_by_rate(
     """
     time, n = end - gap, len(model.slope)
     while time < end:
-        stop, later = end, last_jump(model.times, time) + 1
+        stop, later = end, change_before(model.times, time) + 1
         if later < len(model.times) and model.times[later] < stop:
             stop = model.times[later]
         # Steps of equal length up to a jump of the input.

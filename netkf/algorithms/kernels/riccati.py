@@ -72,7 +72,7 @@ def hamiltonian(A: FloatArray, Q: FloatArray, G: FloatArray) -> tuple[FloatArray
     return np.block([[-A.T, G * scale], [Q / scale, A]]), scale
 
 
-def riccati_flow(A: FloatArray, Q: FloatArray, G: FloatArray, gap: float) -> RiccatiFlow:
+def flow_covariance(A: FloatArray, Q: FloatArray, G: FloatArray, gap: float) -> RiccatiFlow:
     """Return the flow of ``dP = A P + P A' + Q - P G P`` over ``gap`` >= 0 seconds; ``A, Q, G`` are
     (n, n). Entries are nan or infinite where an unstable plant overflows.
     """

@@ -589,11 +589,11 @@ def propagate_level(
             values[begin + i * n + j] = levels[m, level, 0, i, j]
             if observed:
                 values[flow + i * n + j] = levels[m, level, 1, i, j]
-        # A copy, since transform_root() overwrites T.
+        # A copy, since predict_root_lanes() overwrites T.
         for j in range(i + 1):
             T[i, j] = levels[m, level, 3, i, j]
     propagate_mean(ONE, size, x[k], values, scratch.moved)
-    transform_root(ONE, size, root[k], values, flow, scratch.wide, T)
+    predict_root_lanes(ONE, size, root[k], values, flow, scratch.wide, T)
 
 
 @kernel(inlined=True)
@@ -642,7 +642,7 @@ def propagate_by_series(
         condition_root(ONE, size, S, scratch.values, V)
     propagate_mean(ONE, size, mean, scratch.values, moved)
     cholesky_in_lanes(ONE, size, T, scratch.values)
-    transform_root(ONE, size, S, scratch.values, offset_of_F(n, observed), V, T)
+    predict_root_lanes(ONE, size, S, scratch.values, offset_of_F(n, observed), V, T)
     for i in range(n):
         x[k, i] = mean[i]
         for j in range(i + 1):
@@ -782,7 +782,7 @@ def cholesky_in_lanes(lanes: Lanes, size: Size, T: FloatArray, packed: FloatArra
 
 
 @kernel(inlined=True, fused=True)
-def transform_root(
+def predict_root_lanes(
     lanes: Lanes,
     size: Size,
     S: FloatArray,

@@ -57,7 +57,7 @@ ALL = -2
 """``run.receiver`` where a message is for all receivers."""
 
 
-class SlotTables(Struct):
+class SlotModelArrays(Struct):
     """The model of a slot that all nodes believe: F (n, n) and the lower triangular root of Q."""
 
     F: FloatArray
@@ -97,7 +97,7 @@ class SlotRun(Struct):
 
     size: Size
     lanes: Lanes
-    model: SlotTables
+    model: SlotModelArrays
     first: IntArray
     sender: IntArray
     opposite: IntArray
@@ -288,10 +288,10 @@ def transition(model: Any, run: Any, x: FloatArray, k: int, out: FloatArray) -> 
     """
 
 
-@transition.register(SlotTables)
+@transition.register(SlotModelArrays)
 @kernel
 def _transition_of_slot(
-    model: SlotTables, run: Any, _x: FloatArray, _k: int, out: FloatArray
+    model: SlotModelArrays, run: Any, _x: FloatArray, _k: int, out: FloatArray
 ) -> None:
     n = len(run.size)
     for i in range(n):
@@ -316,34 +316,34 @@ def _transition_of_gap(
             out[i, c, 0] = model.mean[0, i]
 
 
-@predict_copy.register(SlotTables)
+@predict_copy.register(SlotModelArrays)
 @kernel(inlined=True)
-def predict_slot(model: SlotTables, run: Any, x: FloatArray, root: FloatArray, k: int) -> None:
+def predict_slot(model: SlotModelArrays, run: Any, x: FloatArray, root: FloatArray, k: int) -> None:
     """Predict by one slot: ``x <- F x``, ``P <- F P F' + Q``."""
     F = model.F
     transform_mean(run.lanes, run.size, x, k, F, run.moved_mean)
     transform_root(run.lanes, run.size, root, k, F, model.root_Q, (run.moved, run.noise))
 
 
-@predict_estimate.register(SlotTables)
+@predict_estimate.register(SlotModelArrays)
 @kernel(inlined=True)
 def _predict_in_slot(
-    model: SlotTables, run: Any, x: FloatArray, root: FloatArray, k: int, _h: int
+    model: SlotModelArrays, run: Any, x: FloatArray, root: FloatArray, k: int, _h: int
 ) -> None:
     predict_slot(model, run, x, root, k)
 
 
-@carry.register(SlotTables)
+@carry.register(SlotModelArrays)
 @kernel(inlined=True)
 def carry_in_slot(
-    model: SlotTables, run: Any, x: FloatArray, root: FloatArray, m: int, age: float
+    model: SlotModelArrays, run: Any, x: FloatArray, root: FloatArray, m: int, age: float
 ) -> None:
     """Do nothing: messages are used in the slot in which they are sent."""
 
 
-@carry_mean.register(SlotTables)
+@carry_mean.register(SlotModelArrays)
 @kernel(inlined=True)
-def carry_mean_in_slot(model: SlotTables, run: Any, x: FloatArray, m: int, age: float) -> None:
+def carry_mean_in_slot(model: SlotModelArrays, run: Any, x: FloatArray, m: int, age: float) -> None:
     """Do nothing, see ``carry_in_slot``."""
 
 
@@ -363,10 +363,10 @@ def _carry_mean_over_age(model: ClockTables, run: Any, x: FloatArray, m: int, ag
         x[m, i, 0] = model.mean[0, i]
 
 
-@update_estimate.register(SlotTables)
+@update_estimate.register(SlotModelArrays)
 @kernel(inlined=True)
 def update_in_slot(
-    _model: SlotTables, run: Any, x: FloatArray, root: FloatArray, k: int, _h: int
+    _model: SlotModelArrays, run: Any, x: FloatArray, root: FloatArray, k: int, _h: int
 ) -> None:
     """Update with the reading of the slot."""
     use_reading(run, x, root, k, run.reading, True)
@@ -583,7 +583,7 @@ def shift_payload(record: Any, m: int, run: Any) -> None:
 
 
 @kernel
-def interval(record: Any, h: int, run: Any) -> float:
+def max_increment_interval(record: Any, h: int, run: Any) -> float:
     """Return the longest interval (seconds) of increments for one update: P changes on the time
     scale 1 / trace(P G), G = H' R^-1 H.
     """
@@ -617,4 +617,4 @@ class Estimates(Struct):
     root: FloatArray
 
 
-reads_only(Estimates, predict, update, shift, interval)
+reads_only(Estimates, predict, update, shift, max_increment_interval)

@@ -80,7 +80,7 @@ def sampling_clocks(scenario: Scenario) -> ClockGroup:
     return ClockGroup(tuple(entities), np.array(rates), tuple(laws), tuple(labels))
 
 
-def ticks_of(scenario: Scenario, run: Run) -> TickCounts | None:
+def tick_counts(scenario: Scenario, run: Run) -> TickCounts | None:
     """Return counts of ticks, None without clocks. Links that tick in contacts are counted in the
     time of contacts; ``off`` is the largest distance of a tick from one.
     """
@@ -93,7 +93,7 @@ def ticks_of(scenario: Scenario, run: Run) -> TickCounts | None:
     if clock.at == "links":
         # Both nodes share the clock of a link, whose entity has the smaller id first.
         columns = [np.minimum(*columns), np.maximum(*columns)]
-    owners = _places(group.entities, columns)
+    owners = _entity_indices(group.entities, columns)
     if not isinstance(clock, Contacts):
         return count_ticks(group, rows["t"], owners, scenario.horizon)
     ids = list(zip(*(column.tolist() for column in columns), strict=True))
@@ -109,17 +109,17 @@ def ticks_of(scenario: Scenario, run: Run) -> TickCounts | None:
     return count_ticks(group, times, owners, scenario.horizon)._replace(off=np.array(off))
 
 
-def samples_of(scenario: Scenario, run: Run) -> TickCounts | None:
+def sample_counts(scenario: Scenario, run: Run) -> TickCounts | None:
     """Return counts of samples of sensors, drawn again; None without clocks."""
     group = sampling_clocks(scenario)
     if not group.entities:
         return None
-    times = draw_samples(scenario, group.entities, run.seed, run.replica)
+    times = redraw_samples(scenario, group.entities, run.seed, run.replica)
     owners = np.repeat(np.arange(len(times)), [len(t) for t in times])
     return count_ticks(group, np.concatenate(times), owners, scenario.horizon)
 
 
-def draw_samples(
+def redraw_samples(
     scenario: Scenario, entities: Sequence[Entity], seed: int, replica: int
 ) -> list[FloatArray]:
     """Return the times (s) of samples of each of the ``entities`` in a ``replica``, drawn again."""
@@ -127,7 +127,7 @@ def draw_samples(
     return [times[entity] for entity in entities]
 
 
-def draw_ticks(
+def redraw_ticks(
     scenario: Scenario, entities: Sequence[Entity], seed: int, replica: int
 ) -> list[FloatArray]:
     """Return the ticks (s) of each of the ``entities`` in a ``replica``, drawn again."""
@@ -155,7 +155,7 @@ def loss_law(scenario: Scenario) -> LossLaw:
     delivery = [stated.mean_delivery(scenario.transmission(link)) for link in links]
     at_once = getattr(clock, "at", "links") == "links"
     senders, receivers = np.array(links, dtype=np.int64).reshape(-1, 2).T
-    opposite = _places(links, [receivers, senders])
+    opposite = _entity_indices(links, [receivers, senders])
     hops = None
     if channel.channels is not None:
         alone = [stated_delivery(loss, scenario.transmission(link)) for link in links]
@@ -193,7 +193,7 @@ def _redraws_links(scenario: Scenario) -> bool:
     return all(filter_.timing.redraws(*step) for step in steps)
 
 
-def losses_of(scenario: Scenario, messages: np.ndarray) -> LossCounts | None:
+def loss_counts(scenario: Scenario, messages: np.ndarray) -> LossCounts | None:
     """Return counts of sent and lost messages by window and direction, from MESSAGE rows (M,); None
     without links.
     """
@@ -221,7 +221,7 @@ def losses_of(scenario: Scenario, messages: np.ndarray) -> LossCounts | None:
 
 
 def _directions(scenario: Scenario, messages: np.ndarray) -> IntArray:
-    return _places(scenario.topology.directions, [messages["sender"], messages["receiver"]])
+    return _entity_indices(scenario.topology.directions, [messages["sender"], messages["receiver"]])
 
 
 def _pairs_of_hearers(messages: np.ndarray, is_lost: np.ndarray) -> list[np.ndarray]:
@@ -234,7 +234,7 @@ def _pairs_of_hearers(messages: np.ndarray, is_lost: np.ndarray) -> list[np.ndar
     return [np.array(float((k * (k - 1) // 2).sum())) for k in (sizes, gone)]
 
 
-def _places(entities: Sequence[Entity], columns: Sequence[np.ndarray]) -> IntArray:
+def _entity_indices(entities: Sequence[Entity], columns: Sequence[np.ndarray]) -> IntArray:
     """Return the index among ``entities`` of each row of the ``columns`` of ids, -1 for none."""
     # -1 stands for no node.
     known = np.array(entities, dtype=np.int64).reshape(-1, len(columns)).T + 1
@@ -256,7 +256,7 @@ def _places(entities: Sequence[Entity], columns: Sequence[np.ndarray]) -> IntArr
     return np.where(keys[found] == wanted, found, -1).astype(np.int64)
 
 
-def pairs_of(scenario: Scenario, run: Run) -> PairCounts | None:
+def pair_counts(scenario: Scenario, run: Run) -> PairCounts | None:
     """Return for L links the slots in the matching, and in two in a row; None if not drawn."""
     if not isinstance(scenario.network.activation, Matching):
         return None
@@ -285,7 +285,7 @@ def stated_delay(scenario: Scenario) -> tuple[float | None, Any]:
     return stated_part(delay, "delay").fixed, stated_law(delay, "delay")
 
 
-def delays_of(scenario: Scenario, messages: np.ndarray) -> DelayCounts | None:
+def delay_counts(scenario: Scenario, messages: np.ndarray) -> DelayCounts | None:
     """Return counts of delays by direction, from MESSAGE rows (M,); None without links or a stated
     law. Messages that have not arrived when the run ends take longer than that.
     """

@@ -18,7 +18,7 @@ from netkf.checks.parts.samples import PartSamples
 from netkf.core.clock import Entity
 from netkf.core.errors import ScenarioError
 from netkf.laws import delays, losses, ticks
-from netkf.laws.intervals import Comparison, with_drawn
+from netkf.laws.intervals import LawComparison, with_drawn
 from netkf.laws.stating import stated_part
 from netkf.laws.ticks import ClockGroup
 from netkf.linalg.arrays import FloatArray
@@ -55,7 +55,7 @@ which nothing else is simulated.
 """
 
 
-class Clocks(NamedTuple):
+class JudgedClocks(NamedTuple):
     """The clocks of the network, or of sensors: which these are in a scenario, the field of
     PartSamples with their counts, how they are drawn, the group of their rows, and words of these.
     """
@@ -68,13 +68,13 @@ class Clocks(NamedTuple):
     noun: str
 
 
-NETWORK = Clocks(
-    events.network_clocks, "ticks", events.draw_ticks, evidence.CLOCKS, "clocks tick", "ticks"
+NETWORK = JudgedClocks(
+    events.network_clocks, "ticks", events.redraw_ticks, evidence.CLOCKS, "clocks tick", "ticks"
 )
-SENSORS = Clocks(
+SENSORS = JudgedClocks(
     events.sampling_clocks,
     "sampling",
-    events.draw_samples,
+    events.redraw_samples,
     evidence.SAMPLING,
     "sensors sample",
     "samples",
@@ -84,7 +84,7 @@ CONTACT_SENTENCE = "links tick in their contacts only"
 
 @lru_cache(maxsize=4)
 def _drawn_counts(
-    clocks: Clocks, scenario: Scenario, seed: int, first: int, count: int
+    clocks: JudgedClocks, scenario: Scenario, seed: int, first: int, count: int
 ) -> np.ndarray:
     entities, replicas = clocks.group(scenario).entities, range(first, first + count)
     drawn = (clocks.draw(scenario, entities, seed, replica) for replica in replicas)
@@ -103,7 +103,7 @@ def _number_drawn(group: ClockGroup, horizon: float, runs: float) -> int:
     return int(further) if further >= MIN_DRAWN_SHARE * runs else 0
 
 
-def _check_rates(clocks: Clocks, samples: PartSamples, level: float) -> Finding:
+def _check_rates(clocks: JudgedClocks, samples: PartSamples, level: float) -> Finding:
     scenario, group = samples.scenario, clocks.group(samples.scenario)
     windows, horizon = getattr(samples, clocks.field).ticks, scenario.horizon
     counts, runs = windows.sum(axis=1), len(windows)
@@ -125,7 +125,7 @@ def _check_rates(clocks: Clocks, samples: PartSamples, level: float) -> Finding:
     distances = ticks.rates_of_all(group, windows, float(slack.sum()), horizon, level / 3.0)
     distances += zip(singles, group.labels, strict=True)
     text = f"{windows.sum():,.0f} ticks, relative difference from the rates,"
-    finding = find(Comparison(distances, text, overall=1), RATE_TOLERANCE)
+    finding = find(LawComparison(distances, text, overall=1), RATE_TOLERANCE)
     # A reader is told where more ticks are needed, and not a better test.
     worst = max(range(len(singles)), key=lambda k: singles[k].detectable)
     if singles[worst].detectable <= WANTED_RATE or not group.poisson:
@@ -135,7 +135,7 @@ def _check_rates(clocks: Clocks, samples: PartSamples, level: float) -> Finding:
     return finding._replace(message=f"{finding.message}; of one clock, {note} {number:,.0f} ticks")
 
 
-def _check_gaps(clocks: Clocks, samples: PartSamples, level: float) -> Finding:
+def _check_gaps(clocks: JudgedClocks, samples: PartSamples, level: float) -> Finding:
     shares, neighbours = ticks.compare_gaps(getattr(samples, clocks.field), level)
     finding = find(shares, SHARE_TOLERANCE)
     # The correlation is reported if it is significant, and the law of single gaps is not wrong.
@@ -147,20 +147,20 @@ def _check_gaps(clocks: Clocks, samples: PartSamples, level: float) -> Finding:
     return finding
 
 
-def _check_lattice(clocks: Clocks, samples: PartSamples, level: float) -> Finding:
+def _check_lattice(clocks: JudgedClocks, samples: PartSamples, level: float) -> Finding:
     counts = getattr(samples, clocks.field)
     message = f"{counts.ticks.sum():,.0f} ticks, times in units of the length of a run"
     off = float(counts.off.max()) / samples.scenario.horizon
     return find_identity(off, TIME_TOLERANCE, message)
 
 
-def _clocks_apart(clocks: Clocks, samples: PartSamples, level: float) -> Finding:
+def _clocks_apart(clocks: JudgedClocks, samples: PartSamples, level: float) -> Finding:
     group, counts = clocks.group(samples.scenario), getattr(samples, clocks.field)
     comparison = ticks.compare_clocks(group, counts.ticks, samples.scenario.horizon, level)
     return find(comparison, DISPERSION_TOLERANCE)
 
 
-def _clock_promises(clocks: Clocks, samples: PartSamples) -> list[Promise]:
+def _clock_promises(clocks: JudgedClocks, samples: PartSamples) -> list[Promise]:
     counts, group = getattr(samples, clocks.field), clocks.group(samples.scenario)
     act, noun, rows = clocks.act, clocks.noun, []
 
@@ -230,7 +230,7 @@ def _row(text: str, group: str, test: Test, *needs: str, exact: bool = False) ->
 
 
 def _loss_row(
-    text: str, compare: Callable[..., Comparison], tolerance: float, *needs: str
+    text: str, compare: Callable[..., LawComparison], tolerance: float, *needs: str
 ) -> Promise:
     def test(samples: PartSamples, level: float) -> Finding:
         return find(compare(loss_law(samples.scenario), samples.fates, level), tolerance)
@@ -254,7 +254,7 @@ BURSTS = _loss_row(
 )
 SHARED_ROW = _loss_row(
     "hearers of a broadcast lose it together as often as the scenario says",
-    losses.compare_shares,
+    losses.compare_joint_losses,
     PROBABILITY_TOLERANCE,
     SAME,
 )

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from netkf.checks.parts.events import (
-    delays_of,
-    losses_of,
-    pairs_of,
-    samples_of,
-    ticks_of,
+    delay_counts,
+    loss_counts,
+    pair_counts,
+    sample_counts,
+    tick_counts,
 )
 from netkf.checks.parts.noises import plant_noises, reading_noises
 from netkf.laws import stack_runs
@@ -44,13 +44,13 @@ def summarise_parts(scenario: Scenario, run: Run) -> dict[str, Any]:
     """
     streams, messages = Streams(run.seed, run.replica), join_messages(run.log)
     found = {
-        "ticks": ticks_of(scenario, run),
-        "fates": losses_of(scenario, messages),
-        "pairs": pairs_of(scenario, run),
+        "ticks": tick_counts(scenario, run),
+        "fates": loss_counts(scenario, messages),
+        "pairs": pair_counts(scenario, run),
         "steps": plant_noises(scenario, streams),
         "readings": reading_noises(scenario, streams),
-        "delays": delays_of(scenario, messages),
-        "sampling": samples_of(scenario, run),
+        "delays": delay_counts(scenario, messages),
+        "sampling": sample_counts(scenario, run),
     }
     return {name: part for name, part in found.items() if part is not None}
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from netkf.algorithms.filter import may_be_silent
-from netkf.checks.parts.events import draw_ticks
+from netkf.checks.parts.events import redraw_ticks
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.network.clocks import LinkClock, OnReadings
 from netkf.network.matchings import RecordedSlots
@@ -252,7 +252,7 @@ def _ticked(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
     if silent or not isinstance(clock, LinkClock) or isinstance(clock, OnReadings):
         return
     entities = list(clock.entities(scenario.topology))
-    times = draw_ticks(scenario, entities, run.seed, run.replica)
+    times = redraw_ticks(scenario, entities, run.seed, run.replica)
     owner = np.repeat(np.arange(len(entities)), [len(part) for part in times])
     drawn = np.concatenate([np.empty(0), *times])
     order = np.lexsort((owner, drawn))

@@ -14,7 +14,13 @@ import numpy as np
 from netkf.algorithms.exchanges import exchanges_estimates
 from netkf.algorithms.filter import compiled_kernels
 from netkf.algorithms.records import Record
-from netkf.engines.compiled.batch_arrays import BatchArrays, begin, finish, no_batch, reset_filters
+from netkf.engines.compiled.batch_arrays import (
+    BatchArrays,
+    begin_run,
+    finish,
+    no_batch,
+    reset_filters,
+)
 from netkf.engines.compiled.events import (
     ABSORB,
     DELIVER,
@@ -152,7 +158,7 @@ def simulate_together(state: Simulation, visits: Visits, batch: BatchArrays, gro
     simulate_agenda(state, visits.memory, batch.memory, progress, pause)
 
 
-def advance_alone(state: Simulation, visits: Visits) -> int:
+def simulate_single_run(state: Simulation, visits: Visits) -> int:
     """Simulate one run until it needs something from Python; return the request (WANT_... or DONE).
     Changes ``state``, the run; ``visits`` is an empty queue, and empty again after the call.
     """
@@ -219,7 +225,7 @@ def simulate_group(
     state.first_run = first
     for k in range(len(progress)):
         reset_filters(state, batch, k * len(state.nodes))
-        begin(state, batch, first + k)
+        begin_run(state, batch, first + k)
         suspend(state, batch, progress, k)
     # Each run in turn up to the same time; then the visits of all runs together.
     pauses, frame, running = 1, next_of(state.frames, 0), True

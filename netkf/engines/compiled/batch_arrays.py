@@ -69,7 +69,7 @@ def no_batch() -> BatchArrays:
 
 
 @kernel
-def begin(state: Simulation, batch: BatchArrays, run: int) -> None:
+def begin_run(state: Simulation, batch: BatchArrays, run: int) -> None:
     """Set the indices of ``state`` to time 0 of run number ``run`` of a batch, its counts to 0, and
     forget the polynomials of its path.
     """

@@ -11,7 +11,7 @@ import numpy as np
 from netkf.algorithms.kernels.at_rest import empty_inbox, run_at_rest
 from netkf.algorithms.kernels.gates import GateTables, gate_tables, no_gate, own_sizes
 from netkf.algorithms.kernels.nonlinear_rows import linear_rows
-from netkf.algorithms.kernels.pairs import no_pairs, pairs_of
+from netkf.algorithms.kernels.pairs import empty_pairs, no_pairs
 from netkf.algorithms.kernels.rates import RateRun
 from netkf.algorithms.kernels.run import (
     ClockRun,
@@ -26,7 +26,7 @@ from netkf.engines.compiled.clock_loop import NO_MODELS, batch_loop, clock_loop,
 from netkf.engines.compiled.nonlinear_samples import nonlinear_sensors
 from netkf.engines.compiled.quantiser import PayloadQuantiser
 from netkf.engines.compiled.samples import entries_of
-from netkf.engines.compiled.slot_pairs import BlockColumns, common_table
+from netkf.engines.compiled.slot_pairs import PairColumns, common_table
 from netkf.engines.compiled.state import (
     Filters,
     Instants,
@@ -54,7 +54,7 @@ class ClockFilters:
     ) -> None:
         self.kernels = kernels
         self._p = self._samples = 1
-        columns = BlockColumns(scenario, entries_of(scenario))
+        columns = PairColumns(scenario, entries_of(scenario))
         self._columns, self._n = (columns.width, columns.entries.shape[1]), scenario.plant.n
         self._gate = scenario.filter.gate
         pooled = scenario.node_filter.timing.pooled
@@ -187,7 +187,7 @@ class ClockFilters:
             count = readings * self._samples
             rows = linear_rows(count, self._p, np.full((count, columns), -1))
             rows.R[0], rows.origin = np.eye(self._p), np.zeros((1, self._n))
-            pairs = pairs_of(rows, own, np.zeros(1 + readings, dtype=np.int64))
+            pairs = empty_pairs(rows, own, np.zeros(1 + readings, dtype=np.int64))
         return {
             "pairs": pairs,
             "gate": self._gate_of_instants(),

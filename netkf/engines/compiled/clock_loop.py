@@ -18,7 +18,7 @@ from netkf.algorithms.kernels.run import ClockRun, interval_end
 from netkf.algorithms.records import Kernels
 from netkf.core.instants import snapped
 from netkf.engines.base import LONGER, MIN_GAP_SHARE
-from netkf.engines.compiled.batch_arrays import BatchArrays, begin, finish, reset_messages
+from netkf.engines.compiled.batch_arrays import BatchArrays, begin_run, finish, reset_messages
 from netkf.engines.compiled.events import (
     ABSORB,
     CLIP,
@@ -65,7 +65,7 @@ from netkf.engines.compiled.events import (
     store_sample,
 )
 from netkf.engines.compiled.increments import fill_readings
-from netkf.engines.compiled.message_queue import push, release, sort_indices, take
+from netkf.engines.compiled.message_queue import push, release, sort_indices, take_free
 from netkf.engines.compiled.nonlinear_samples import (
     linearise_instant,
     no_table,
@@ -369,7 +369,7 @@ def send_all(
     becomes = reached(state, first, after, outcome)
     if becomes == NONE_SENT and not broadcast:
         return
-    m = take(state)
+    m = take_free(state)
     arrives = becomes == SOME_ARRIVE or verbs.counts_sends == 1 or verbs.decides == 1
     run.sends[0] = 1
     choose_model(state, run, verbs, h)
@@ -388,10 +388,10 @@ def send_all(
     for k in range(first, after):
         w = state.outgoing[k]
         delay = snapped(ticks.delay[outcome + k - first], state.per_second)
-        if is_sent(state, w, delay, now):
+        if send_on_link(state, w, delay, now):
             copy = m
             if used:
-                copy = take(state)
+                copy = take_free(state)
                 if verbs.addressed == 0:
                     call_at_two(verbs.copy, record, copy, m, run)
             used = True
@@ -534,7 +534,7 @@ def whiten_pairs(state: Simulation, run: ClockRun, r: int, instant: int) -> None
 
 
 @kernel
-def is_sent(state: Simulation, w: int, delay: float, now: float) -> bool:
+def send_on_link(state: Simulation, w: int, delay: float, now: float) -> bool:
     """Record that a message is sent on directed link ``w``, unless it is OUT_OF_RANGE, and whether
     it is lost, which a ``delay`` that is negative or nan says; return True if it will arrive.
     """
@@ -596,7 +596,7 @@ def batch_loop(
                 state.nodes[h] = batch.nodes[h]
                 state.now[h] = 0.0
             reset_messages(state)
-            begin(state, batch, r)
+            begin_run(state, batch, r)
         resumed, request = False, -1
         while request != DONE:
             request = clock_loop(state, record, run, verbs)

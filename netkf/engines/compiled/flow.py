@@ -16,7 +16,7 @@ from netkf.algorithms.filter import compiled_kernels
 from netkf.algorithms.kernels.root_flow import FlowScratch
 from netkf.core.interrupts import defer_signals
 from netkf.engines.base import Progress
-from netkf.engines.compiled.agenda import advance_alone, is_immediate
+from netkf.engines.compiled.agenda import is_immediate, simulate_single_run
 from netkf.engines.compiled.clock_filters import ClockFilters
 from netkf.engines.compiled.draws import Noise, Paths, blocks_at_once, no_path, no_sensing
 from netkf.engines.compiled.events import (
@@ -30,7 +30,7 @@ from netkf.engines.compiled.events import (
     WANT_TICKS,
 )
 from netkf.engines.compiled.lane_series import series_of_lanes
-from netkf.engines.compiled.life_tables import life_table, silence
+from netkf.engines.compiled.life_tables import life_table, remove_samples
 from netkf.engines.compiled.pair_exchange import pair_exchange
 from netkf.engines.compiled.quantiser import PayloadQuantiser, dither_of
 from netkf.engines.compiled.sample_tables import samples_of
@@ -124,7 +124,7 @@ class Source:
             samples.read(x, sampled, -math.inf, math.inf)
         self.lives = life_table(scenario, streams)
         if not self.lives.in_nodes:
-            silence(samples.instants, self.lives, scenario.topology.index)
+            remove_samples(samples.instants, self.lives, scenario.topology.index)
         index = scenario.topology.index
         self.clocks = {index[i]: c for i, c in node_times(scenario, streams).items()}
         known = {"instants": samples.instants, "truth": self.states, "lives": self.lives}
@@ -335,7 +335,7 @@ class FlowRun:
             # Any value but DONE.
             request = WANT_ROWS
             while request != DONE:
-                request = self._advance()
+                request = self._run_events()
                 # Samples first: the run ends at the first one that is not finite, with the rows
                 # before it.
                 if not self._record_samples():
@@ -350,11 +350,11 @@ class FlowRun:
                     self._recorder.flush()
         return "complete"
 
-    def _advance(self) -> int:
+    def _run_events(self) -> int:
         if self._clocked is not None:
             return self._clocked.advance(self._state)
         assert self._visits is not None
-        return advance_alone(self._state, self._visits)
+        return simulate_single_run(self._state, self._visits)
 
     def _fulfil(self, request: int) -> None:
         state = self._state

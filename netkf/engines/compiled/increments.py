@@ -155,7 +155,7 @@ def next_interval(rate: float, now: float, time: float, least: float) -> tuple[f
 
 
 @kernel
-def advance_over_interval(
+def predict_over_interval(
     state: Simulation, run: int, h: int, k: int, piece: int, now: float, end: float
 ) -> None:
     """Predict node ``h`` of run number ``run``, whose estimate is in row ``k``, from ``now`` to

@@ -81,7 +81,7 @@ def life_table(scenario: Scenario, streams: Streams) -> LifeTable:
     return LifeTable(*changes, down, in_nodes)
 
 
-def silence(instants: Instants, lives: LifeTable, index: dict[int, int]) -> None:
+def remove_samples(instants: Instants, lives: LifeTable, index: dict[int, int]) -> None:
     """Take away the samples of nodes that are down, of a filter that reads all sensors: they are of
     no node, and of a sensor without rows; those of a whole instant become some of the one before.
     """

@@ -49,7 +49,7 @@ def pop(pool: np.ndarray, heap: np.ndarray, size: int) -> int:
 
 
 @kernel
-def take(state: Simulation) -> int:
+def take_free(state: Simulation) -> int:
     """Remove a free message from the pool and return its index."""
     # The free messages are a linked list: a stack, so that recently used memory comes first.
     message = state.first_free

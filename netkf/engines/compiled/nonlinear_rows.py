@@ -55,10 +55,10 @@ class NonlinearSetup:
             turned = row + len(R) - sensor.turns
             self.kind[h, row:turned], self.kind[h, turned : rows.stop] = RANGE, BEARING
             self.dimensions[h, rows] = len(sensor.states)
-            self.states[h, rows, : len(sensor.states)] = self._places(h, sensor.states)
+            self.states[h, rows, : len(sensor.states)] = self._state_indices(h, sensor.states)
             self.relative[h, rows] = isinstance(sensor, RelativePositionSensor)
             if sensor.heading is not None:
-                self.heading[h, rows] = self._places(h, [sensor.heading])
+                self.heading[h, rows] = self._state_indices(h, [sensor.heading])
             return
         self.kind[h, row], self.kind[h, row + 1 : rows.stop] = CUSTOM, OF_CUSTOM
         self.length[h, row] = p = len(R)
@@ -70,7 +70,7 @@ class NonlinearSetup:
         entries: np.ndarray = self._entries[min(h, len(self._entries) - 1)]
         return entries
 
-    def _places(self, h: int, states: Sequence[int]) -> np.ndarray:
+    def _state_indices(self, h: int, states: Sequence[int]) -> np.ndarray:
         """Return which of the states of filter ``h`` these states of the plant are."""
         return np.array([np.flatnonzero(self._of(h) == state)[0] for state in states])
 
@@ -82,7 +82,7 @@ class NonlinearSetup:
         if not has_known_h(sensor):
             made[0] = place
         elif isinstance(sensor, RelativePositionSensor):
-            others = self._places(h, sensor.other_states(place))
+            others = self._state_indices(h, sensor.other_states(place))
             made[: len(others)] = others
         else:
             positions = np.asarray(sensor.positions, dtype=np.float64)

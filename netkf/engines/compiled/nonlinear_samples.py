@@ -25,7 +25,7 @@ from netkf.core.places import Place
 from netkf.engines.compiled.nonlinear_rows import NonlinearSetup
 from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.samples import entries_of
-from netkf.engines.compiled.slot_pairs import BlockColumns
+from netkf.engines.compiled.slot_pairs import PairColumns
 from netkf.engines.compiled.state import NOBODY
 from netkf.linalg.addresses import reads_only
 from netkf.linalg.arrays import FloatArray, IntArray
@@ -138,7 +138,7 @@ class NonlinearSensors(NamedTuple):
     """
 
     setup: NonlinearSetup
-    columns: BlockColumns
+    columns: PairColumns
     R: FloatArray
     sensors: list[tuple[Any, int, int]]
     anchors: list[int]
@@ -149,7 +149,7 @@ def nonlinear_sensors(scenario: Scenario) -> NonlinearSensors:
     """Return what kernels know of the sampled sensors of a scenario."""
     index, pooled = scenario.topology.index, scenario.node_filter.timing.pooled
     placed = [(node, p) for node, many in scenario.sampled_sensors.items() for p in many]
-    columns = BlockColumns(scenario, entries_of(scenario))
+    columns = PairColumns(scenario, entries_of(scenario))
     believed = [scenario.noise_covariance(p.entry, believed=True) for _, p in placed]
     count, p, w = len(placed), max(map(len, believed), default=1), columns.entries.shape[1]
     sensors = [
@@ -246,7 +246,7 @@ def _fill(table: NonlinearTable, known: NonlinearSensors, k: int, samples: IntAr
         table.R = np.concatenate([table.R, noises])
 
 
-def block_of(columns: BlockColumns, place: Place | None) -> int:
+def block_of(columns: PairColumns, place: Place | None) -> int:
     """Return the number of the block that a sample is also about, see ``Instants.block``."""
     number = columns.number(place)
     return number if place is None or number >= 0 else NOBODY

@@ -67,7 +67,7 @@ FIXED, EXPONENTIAL, UNIFORM, LOGNORMAL, LISTED = range(5)
 NUMBER = MESSAGE.index("number")
 
 
-class Chances(NamedTuple):
+class DeliveryLaws(NamedTuple):
     """The law of a KernelLoss for the messages of R runs on W directions.
 
     address, settings : of the kernel (``linalg.functions``); 0: the law is a built-in one
@@ -104,7 +104,7 @@ class ChannelStreams(NamedTuple):
     source: IntArray
     per_run: int
     delivery: FloatArray
-    chances: Chances
+    chances: DeliveryLaws
     loss: np.ndarray
     state: np.ndarray
     delay: np.ndarray
@@ -154,10 +154,10 @@ def draw_outcomes(
                     # Below 1, so that a link with probability 1 loses nothing.
                     uniform = next_unit(channels.loss, k)
                 if len(channels.state) > 0:
-                    bad = next_state(channels, k)
+                    bad = next_link_state(channels, k)
                 if channels.law != FIXED:
-                    delay = draw_delay(channels, k)
-            arrives = uniform < chance_of(channels, run, w, bad, t)
+                    delay = next_delay(channels, k)
+            arrives = uniform < delivery_probability_of(channels, run, w, bad, t)
         if channels.bits:
             outcome |= np.int64(arrives) << (m - first)
         else:
@@ -167,15 +167,17 @@ def draw_outcomes(
 
 
 @kernel(inlined=True)
-def chance_of(channels: ChannelStreams, run: int, w: int, bad: int, t: float) -> float:
+def delivery_probability_of(
+    channels: ChannelStreams, run: int, w: int, bad: int, t: float
+) -> float:
     """Return the delivery probability of the next message on direction ``w``, sent at ``t``."""
     if channels.chances.address == 0:
         return float(channels.delivery[bad, w])
-    return _chance_by_law(channels.chances, run, w, t)
+    return _delivery_by_law(channels.chances, run, w, t)
 
 
 @kernel
-def _chance_by_law(chances: Chances, run: int, w: int, t: float) -> float:
+def _delivery_by_law(chances: DeliveryLaws, run: int, w: int, t: float) -> float:
     k, message = run * len(chances.first) + w, chances.message
     for i in range(len(message)):
         message[i] = chances.first[w, i]
@@ -190,7 +192,7 @@ def _chance_by_law(chances: Chances, run: int, w: int, t: float) -> float:
 
 
 @kernel
-def next_state(channels: ChannelStreams, k: int) -> int:
+def next_link_state(channels: ChannelStreams, k: int) -> int:
     """Return the next state (1: bad, 0: good) of link ``k``, a two-state Markov chain
     (Gilbert-Elliott). The first one has the stationary law.
     """
@@ -207,7 +209,7 @@ def next_state(channels: ChannelStreams, k: int) -> int:
 
 
 @kernel
-def draw_delay(channels: ChannelStreams, k: int) -> float:
+def next_delay(channels: ChannelStreams, k: int) -> float:
     """Return the next random delay (seconds) of stream ``k``."""
     if channels.law == EXPONENTIAL:
         return channels.scale * next_exponential(channels.delay, k, channels.exponential)
@@ -391,7 +393,7 @@ def channel_streams(
         source=senders.source,
         per_run=len(sources),
         delivery=delivery,
-        chances=_chances_of(loss, first, streams.runs),
+        chances=_delivery_laws(loss, first, streams.runs),
         loss=none if listed or loss.deterministic else streams.states("loss", sources),
         state=streams.states("weather", sources) if loss.stateful and not listed else none,
         delay=streams.states("delay", sources) if delay.is_random and not listed else none,
@@ -409,13 +411,13 @@ def channel_streams(
     )
 
 
-def _chances_of(loss: Loss, first: Sequence[Transmission], runs: int) -> Chances:
+def _delivery_laws(loss: Loss, first: Sequence[Transmission], runs: int) -> DeliveryLaws:
     address, settings, messages = 0, np.zeros(0), np.zeros((0, len(MESSAGE)))
     if first:
         assert isinstance(loss, KernelLoss)
         address, settings = loss.kernel_call()
         messages = np.concatenate([loss.describe(sent) for sent in first])
-    return Chances(
+    return DeliveryLaws(
         address=address,
         settings=settings,
         first=messages,

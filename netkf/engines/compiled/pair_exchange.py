@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from netkf.algorithms.kernels.at_rest import run_at_rest
-from netkf.algorithms.kernels.run import SlotRun, SlotTables, size_of
+from netkf.algorithms.kernels.run import SlotModelArrays, SlotRun, size_of
 from netkf.algorithms.records import Kernels, make_records
 from netkf.linalg.addresses import AnyStruct, address_of, any_struct, call_at, call_at_two
 from netkf.linalg.arrays import FloatArray, IntArray
@@ -87,7 +87,7 @@ def _run_of_pairs(n: int, unrolled: bool) -> Any:
         size=size,
         lanes=MANY,
         # Messages take no time: nothing is predicted.
-        model=SlotTables(F=np.eye(n), root_Q=np.zeros((n, n))),
+        model=SlotModelArrays(F=np.eye(n), root_Q=np.zeros((n, n))),
         first=np.arange(3),
         sender=np.array([1, 0]),
         opposite=np.array([1, 0]),

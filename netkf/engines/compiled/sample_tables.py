@@ -15,7 +15,7 @@ from netkf.engines.compiled.nonlinear_samples import block_of, nonlinear_table
 from netkf.engines.compiled.own_sensors import is_own
 from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.samples import entries_of
-from netkf.engines.compiled.slot_pairs import BlockColumns
+from netkf.engines.compiled.slot_pairs import PairColumns
 from netkf.engines.compiled.state import Instants
 from netkf.engines.compiled.ticks import clocks_of, draw_instants, is_kernel_clock
 from netkf.linalg.arrays import FloatArray, IntArray
@@ -50,7 +50,7 @@ class SampledSensor(NamedTuple):
     recorded: bool
 
 
-class Samples(Protocol):
+class SampleInstants(Protocol):
     """The samples of one run, sorted by time into ``instants`` (each a time at which a node takes
     samples and uses them in one update); ``sampled`` (T,) are all their times, in seconds.
     """
@@ -65,7 +65,7 @@ class Samples(Protocol):
         """
 
 
-def samples_of(scenario: Scenario, streams: Streams) -> Samples:
+def samples_of(scenario: Scenario, streams: Streams) -> SampleInstants:
     """Return the samples of a run, drawn in compiled code if possible."""
     cls = KernelSamples if kernel_sensors(scenario) is not None else SampleTables
     return cls(scenario, streams)
@@ -157,7 +157,7 @@ class KernelSamples:
             space *= 2
 
     def read(self, states: FloatArray, times: FloatArray, after: float, until: float) -> None:
-        """Fill in the values of the samples taken in (``after``, ``until``], see Samples."""
+        """Fill in the values of the samples taken in (``after``, ``until``], see SampleInstants."""
         first, last = np.searchsorted(self.t, [after, until], side="right")
         self.read_from(first, states[np.searchsorted(times, self.t[first:last])])
 
@@ -201,7 +201,7 @@ def draw_samples(
 
 
 class SampleTables:
-    """The samples of any sensors, see Samples."""
+    """The samples of any sensors, see SampleInstants."""
 
     def __init__(self, scenario: Scenario, streams: Streams) -> None:
         times = scenario.sample_times(streams)
@@ -247,7 +247,7 @@ class SampleTables:
                 _add_noises(self.instants, sampled.samples, sampled.indices, R)
 
     def read(self, states: FloatArray, times: FloatArray, after: float, until: float) -> None:
-        """Fill in the values of the samples taken in (``after``, ``until``], see Samples."""
+        """Fill in the values of the samples taken in (``after``, ``until``], see SampleInstants."""
         instants = self.instants
         for sensor in self._sensors:
             # (after, until]: a time at the border of two blocks is read once.
@@ -273,7 +273,7 @@ class SampleTables:
                     self._set_matrices(self._columns, sensor, indices, H)
 
     def _set_matrices(
-        self, columns: BlockColumns, sensor: SampledSensor, indices: np.ndarray, H: FloatArray
+        self, columns: PairColumns, sensor: SampledSensor, indices: np.ndarray, H: FloatArray
     ) -> None:
         """Write the H (K, p, N) of samples, and of which block beside their filter's they are."""
         instants, p = self.instants, H.shape[1]
@@ -316,7 +316,7 @@ class SensorTables(NamedTuple):
     varying: np.ndarray
     root: FloatArray
     H: FloatArray
-    columns: BlockColumns
+    columns: PairColumns
     own: FloatArray
     block: np.ndarray
 
@@ -345,7 +345,7 @@ def _sensor_tables(scenario: Scenario) -> SensorTables:
         of_noise = np.linalg.cholesky(R) if part.linear else np.eye(len(R))
         root[k, : len(R), : len(R)], H[k, : len(R)] = of_noise, part.matrix_of(n)
     filters = [0 if pooled else index[node] for node, _ in placed]
-    columns = BlockColumns(scenario, entries_of(scenario))
+    columns = PairColumns(scenario, entries_of(scenario))
     places = [
         columns.other(h, np.flatnonzero(matrix.any(axis=0)))
         for h, matrix in zip(filters, H, strict=True)

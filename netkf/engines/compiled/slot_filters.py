@@ -15,8 +15,8 @@ from netkf.algorithms.kernels.maps import MapRun
 from netkf.algorithms.kernels.pairs import Pairs, no_pairs
 from netkf.algorithms.kernels.run import (
     Estimates,
+    SlotModelArrays,
     SlotRun,
-    SlotTables,
     size_of,
 )
 from netkf.algorithms.models import MapModel, changing_models
@@ -34,7 +34,7 @@ from netkf.engines.compiled.slot_loop import (
     slot_verbs,
 )
 from netkf.engines.compiled.slot_setup import SlotSetup
-from netkf.linalg.addresses import NOTHING, address_of, call_kernel, seen_as
+from netkf.linalg.addresses import NOTHING, address_of, call_kernel, viewed_as
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import LANES, MANY, aligned
 
@@ -105,7 +105,7 @@ class SlotFilters:
         setup = self._setup
         if not isinstance(setup.models[0], MapModel):
             tables = setup.tables[0]
-            return [SlotTables(F=F.copy(), root_Q=root_Q.copy()) for F, root_Q in tables]
+            return [SlotModelArrays(F=F.copy(), root_Q=root_Q.copy()) for F, root_Q in tables]
         delay = 0 if setup.algorithm.timing.predicts else 1
         models = setup.models[: len(setup.tables[0])]
         return [m.tables(LANES, active, delay, setup.width) for m in models]
@@ -217,7 +217,7 @@ class SlotFilters:
             models = setup.model_pieces[piece]
             prepare(setup.algorithm, record, setup.infos, models, first, end - start)
             plan.start, plan.end = start, end
-            seen = seen_as(Estimates, record)
+            seen = viewed_as(Estimates, record)
             slot_loop(seen, self.records.memories, run, plan, samples, verbs)
         for believed in setup.models if isinstance(setup.models[0], MapModel) else ():
             believed.raise_error()

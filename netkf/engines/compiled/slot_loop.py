@@ -16,7 +16,7 @@ from netkf.algorithms.kernels.nonlinear_rows import linearise_rows
 from netkf.algorithms.kernels.run import SlotRun
 from netkf.algorithms.records import Kernels
 from netkf.engines.compiled.quantiser import Quantiser, clear_payload, quantise_payload
-from netkf.linalg.addresses import NOTHING, AnyStruct, address_of, call_at, call_at_two, seen_as
+from netkf.linalg.addresses import NOTHING, AnyStruct, address_of, call_at, call_at_two, viewed_as
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.generic import struct_like
@@ -149,7 +149,7 @@ class AnySlotRun(Struct):
 
 def any_slot_run(run: Struct) -> Any:
     """Return a SlotRun, or what stands for one, as an AnySlotRun."""
-    return seen_as(AnySlotRun, run, size=(np.dtype(np.float64), 1), model=AnyStruct)
+    return viewed_as(AnySlotRun, run, size=(np.dtype(np.float64), 1), model=AnyStruct)
 
 
 def slot_verbs(kernels: Kernels, record: Any, run: Any, talks: bool, linear: bool) -> SlotVerbs:
@@ -214,7 +214,7 @@ def simulate_slot(
                 e += 1
         elif plan.sensed[s] and begun:
             for h in range(len(record.xhat)):
-                choose_model(run, plan, h)
+                use_model_of_run(run, plan, h)
                 if plan.stages[g] == PREDICT:
                     call_at(verbs.predict, record, h, run)
                 else:
@@ -253,7 +253,7 @@ def exchange(
             if plan.uniform.shape[0] > 0:
                 store(lanes, run.uniform, load(lanes, plan.uniform, b, s, e, h))
             run.reading = h
-            choose_model(run, plan, h)
+            use_model_of_run(run, plan, h)
             m = h + run.first[h] if verbs.addressed == 1 else h
             clear_payload(plan.quantiser, m)
             call_at_two(verbs.emit, record, h, m, run)
@@ -266,7 +266,7 @@ def exchange(
     if e != plan.stop:
         for h in range(nodes):
             run.reading = h
-            choose_model(run, plan, h)
+            use_model_of_run(run, plan, h)
             fill_inbox(run, plan, b, s, e, h, verbs.addressed == 1)
             # What is read of other blocks lies behind the messages of all nodes.
             for k in range(run.count if verbs.translate != NOTHING else 0):
@@ -295,7 +295,7 @@ def sample_slot(
     if plan.sample[s] >= 0:
         for h in range(len(record.xhat) if verbs.observe != NOTHING else 0):
             call_at(verbs.observe, record, h, run)
-        store_sample(record.xhat, record.root, run, plan, samples, b, s)
+        write_slot_sample(record.xhat, record.root, run, plan, samples, b, s)
     if plan.rebased[s]:
         # The true state becomes the origin.
         for i in range(len(run.size)):
@@ -305,7 +305,7 @@ def sample_slot(
 
 
 @kernel(inlined=True)
-def choose_model(run: AnySlotRun, plan: SlotPlan, h: int) -> None:
+def use_model_of_run(run: AnySlotRun, plan: SlotPlan, h: int) -> None:
     """Make the model of filter ``h`` that of the run, if it is not that of all."""
     if len(plan.models) > 0:
         run.model = struct_like(run.model, plan.models[h])
@@ -344,7 +344,7 @@ def drop_silent(run: AnySlotRun, plan: SlotPlan, b: int, s: int, e: int) -> None
 
 
 @kernel
-def store_sample(
+def write_slot_sample(
     xhat: FloatArray, root: FloatArray, run: AnySlotRun, plan: SlotPlan, samples: SlotSamples,
     b: int, s: int,
 ) -> None:  # fmt: skip

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.core.instants import snapped
-from netkf.engines.compiled.outcomes import ChannelStreams, chance_of, next_state
+from netkf.engines.compiled.outcomes import ChannelStreams, delivery_probability_of, next_link_state
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import Lanes, load_flags, select, spread, store
@@ -232,10 +232,12 @@ def draw_link(
             uniform[k] = next_unit(channels.loss, k)
             # The channel state (Gilbert-Elliott) takes one step for each activation.
             if len(channels.state) > 0:
-                next_state(channels, k)
+                next_link_state(channels, k)
         last = k
         if links.talks[e, w] == 1:
-            up[w, q] = uniform[k] < chance_of(channels, r, w, max(channels.bad[k], 0), t)
+            up[w, q] = uniform[k] < delivery_probability_of(
+                channels, r, w, max(channels.bad[k], 0), t
+            )
 
 
 @kernel
@@ -321,7 +323,7 @@ class TracedNodes(NamedTuple):
     stopped: np.ndarray
 
 
-class Rows(NamedTuple):
+class EventRows(NamedTuple):
     """Columns (K,) of the event table of one run (trace.schema), and the number of rows before each
     of T samples, ``before_sample`` (T,).
     """
@@ -361,7 +363,7 @@ class Tracing(NamedTuple):
     links: SlotChannels
     nodes: TracedNodes
     messages: SlotMessages
-    rows: Rows
+    rows: EventRows
     pairwise: bool
 
 
@@ -382,7 +384,7 @@ class SlotStage(NamedTuple):
 
 @kernel
 def write_row(
-    rows: Rows, stage: SlotStage, kind: int, node: int, peer: int, message: int, age: float,
+    rows: EventRows, stage: SlotStage, kind: int, node: int, peer: int, message: int, age: float,
     row: int,
 ) -> int:  # fmt: skip
     """Write one event of a ``stage`` into row number ``row``; return the number of the next row.

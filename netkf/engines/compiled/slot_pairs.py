@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.blocks import block_numbers
-from netkf.algorithms.kernels.pairs import Pairs, pairs_of
+from netkf.algorithms.kernels.pairs import Pairs, empty_pairs
 from netkf.algorithms.kernels.run import ALIKE
 from netkf.algorithms.translation import read_vector
 from netkf.core.places import Place
@@ -19,7 +19,7 @@ from netkf.scenario.model import PlacedSensor
 from netkf.scenario.scenario import Scenario
 
 
-class BlockColumns:
+class PairColumns:
     """The columns of a reading in the states of its filter and one block more."""
 
     def __init__(self, scenario: Scenario, entries: np.ndarray) -> None:
@@ -81,7 +81,7 @@ class SlotPair(NamedTuple):
 class SlotPairs:
     """The readings of pairs of a scenario, in the order of their filters."""
 
-    def __init__(self, scenario: Scenario, columns: BlockColumns) -> None:
+    def __init__(self, scenario: Scenario, columns: PairColumns) -> None:
         self._scenario, self.columns = scenario, columns
         self.all: list[SlotPair] = []
 
@@ -121,7 +121,7 @@ class SlotPairs:
         entries = self.columns.entries
         first = np.searchsorted([pair.h for pair in self.all], np.arange(len(entries) + 1))
         rows = self.nonlinear.tables(method, active)
-        pairs = pairs_of(rows, entries.shape[1], first.astype(np.int64))
+        pairs = empty_pairs(rows, entries.shape[1], first.astype(np.int64))
         for k, pair in enumerate(self.all):
             pairs.row[k], pairs.length[k] = pair.row, len(pair.R)
             if pair.sensor.record is None:

@@ -39,7 +39,7 @@ from netkf.engines.compiled.slot_messages import (
     STOP,
     SWAP,
     TICK,
-    Rows,
+    EventRows,
     SlotChannels,
     SlotMessages,
     SlotTimes,
@@ -807,7 +807,7 @@ class SlotRuns:
         nodes = TracedNodes(setup.nodes, setup.sensing, setup.links, self._sent, self._stopped)
         trace = Tracing(
             setup.stages, block.times, self._channels, nodes, block.messages,
-            Rows._make([*columns, before_sample]), setup.algorithm.timing.pairwise,
+            EventRows._make([*columns, before_sample]), setup.algorithm.timing.pairwise,
         )  # fmt: skip
         count = make_rows(trace, first, stop)
         return table[:count]

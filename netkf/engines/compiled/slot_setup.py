@@ -30,7 +30,7 @@ from netkf.engines.compiled.slot_messages import (
     SlotLinks,
     Stages,
 )
-from netkf.engines.compiled.slot_pairs import BlockColumns, SlotPairs, common_table
+from netkf.engines.compiled.slot_pairs import PairColumns, SlotPairs, common_table
 from netkf.linalg.arrays import FloatArray, block_diagonal, enlarged
 from netkf.linalg.lanes import LANES, aligned, blocks_of
 from netkf.linalg.portable import cholesky, solve_lower
@@ -143,7 +143,7 @@ class SlotSetup:
         self.estimators, self.p = 1 if pooled else len(scenario.nodes), 1
         rows = np.zeros(self.estimators, dtype=np.int64)
         self.entries = entries_of(scenario)
-        self.columns = BlockColumns(scenario, self.entries)
+        self.columns = PairColumns(scenario, self.entries)
         self.sensing = np.array(scenario.sensing_nodes, dtype=np.int64)
         self.assigned: list[AssignedSensor] = []
         for node in scenario.sensing_nodes:

@@ -54,7 +54,7 @@ AHEAD = 256
 """Rows of random numbers that are drawn ahead for each link where tables are one slot long."""
 
 
-class Rows(NamedTuple):
+class UnorderedRows(NamedTuple):
     """K rows of events of one kind, before they are in order. A number is the same in all rows.
 
     part : (K,), in which part of the block they are, see ``SlotTables``
@@ -491,13 +491,13 @@ class SlotTables:
         step = messages.slot * len(self._setup.fresh) + messages.step
         return np.asarray(step * len(self._ids) + self._receiver[messages.w])
 
-    def _rows_of(self, times: StepTimes, messages: Messages) -> list[Rows]:
+    def _rows_of(self, times: StepTimes, messages: Messages) -> list[UnorderedRows]:
         """Return the rows of the messages of a block, and of what happens meanwhile."""
         kept = messages.of(times.recorded[messages.slot])
         part, sender, receiver = self._part_of(kept.slot, kept.step), *self._ends_of(kept)
         # Rows of a message in the order of the pairs, forth before back.
         order = 3 * (kept.w % self._setup.directions_per_link)
-        sends = Rows(
+        sends = UnorderedRows(
             part, kept.sent, SEND, sender, receiver, kept.number, self._phase[kept.step],
             group=2, place=kept.place, number=order,
         )  # fmt: skip
@@ -506,7 +506,7 @@ class SlotTables:
             kept.of(ended), part[ended], 2, kept.place[ended], order[ended] + 1
         )
         links = [
-            Rows(np.array([part]), t, kind, i, j, is_up, place=k)
+            UnorderedRows(np.array([part]), t, kind, i, j, is_up, place=k)
             for k, (part, (t, kind, i, j, is_up, *_)) in enumerate(self._links)
         ]
         rows = self._rows_of_ends(kept, part + 2)
@@ -516,18 +516,18 @@ class SlotTables:
         """Return the ids of the senders and receivers, (K,) each."""
         return self._ids[self._sender[messages.w]], self._ids[self._receiver[messages.w]]
 
-    def _rows_of_outcomes(self, ended: Messages, part: IntArray, *order: Any) -> Rows:
+    def _rows_of_outcomes(self, ended: Messages, part: IntArray, *order: Any) -> UnorderedRows:
         """Return the rows with which messages end."""
         sender, receiver = self._ends_of(ended)
         lost, never = ended.outcome == LOST, np.isnan(ended.arrival)
         age = self._grid.snap(ended.arrival - ended.sent)
-        return Rows(
+        return UnorderedRows(
             part, np.where(never, ended.sent, ended.arrival), ended.outcome,
             np.where(lost, sender, receiver), np.where(lost, receiver, sender), ended.number,
             self._phase[ended.step], np.where(lost, NAN, age), *order,
         )  # fmt: skip
 
-    def _rows_of_steps(self, times: StepTimes, uses: Uses) -> list[Rows]:
+    def _rows_of_steps(self, times: StepTimes, uses: Uses) -> list[UnorderedRows]:
         """Return the rows of readings, and those with which the steps of exchanges begin."""
         setup, rows = self._setup, []
         reads = times.recorded & (
@@ -539,30 +539,32 @@ class SlotTables:
             there = reads[:, None] & ~self.lives.is_down(sensing, now[:, None])
             slot, place = np.nonzero(there)
             part = slot * self._parts + 2 + 3 * stage
-            rows.append(Rows(part, now[slot], SENSE, setup.sensing[place], place=place))
+            rows.append(UnorderedRows(part, now[slot], SENSE, setup.sensing[place], place=place))
         if not self._timing.pairwise:
             acts = np.broadcast_to((times.exchanged & times.recorded)[:, None], times.begin.shape)
             slot, step = np.nonzero(acts)
             part, t = self._part_of(slot, step), times.begin[slot, step]
-            rows.append(Rows(part, t, ROUND, -1, phase=self._phase[step], group=1))
+            rows.append(UnorderedRows(part, t, ROUND, -1, phase=self._phase[step], group=1))
             return rows
         used = uses.of(times.recorded[uses.slot] & (uses.w % setup.directions_per_link == 0))
         t, ends = times.begin[used.slot, used.step], (self._sender[used.w], self._receiver[used.w])
         i, j = (self._ids[end] for end in ends)
         part, phase = self._part_of(used.slot, used.step), self._phase[used.step]
         both_down = np.logical_and(*(self.lives.is_down(end, t) for end in ends))
-        ticks = Rows(part, t, TICK, i, j, phase=phase, group=2, place=used.place, number=-1)
+        ticks = UnorderedRows(
+            part, t, TICK, i, j, phase=phase, group=2, place=used.place, number=-1
+        )
         rows.append(_chosen(ticks, ~both_down))
         return rows
 
-    def _rows_of_ends(self, kept: Messages, part: IntArray) -> Rows:
+    def _rows_of_ends(self, kept: Messages, part: IntArray) -> UnorderedRows:
         """Return the rows with which steps end, given the messages of those that are recorded."""
         used = kept.absorbed
         here, part = kept.of(used), part[used]
         node, age = self._receiver[here.w], self._grid.snap(here.arrival - here.sent)
         if self._timing.pairwise:
             peer = self._ids[self._sender[here.w]]
-            return Rows(
+            return UnorderedRows(
                 part, here.closes, SWAP, self._ids[node], peer, here.number,
                 self._phase[here.step], age, place=self._ids[node], number=peer,
             )  # fmt: skip
@@ -570,12 +572,14 @@ class SlotTables:
         key, first, back = np.unique(self._hearings(here), return_index=True, return_inverse=True)
         oldest = np.zeros(len(key))
         np.maximum.at(oldest, back, age)
-        return Rows(
+        return UnorderedRows(
             part[first], here.closes[first], ABSORB, self._ids[node[first]],
             phase=self._phase[here.step[first]], age=oldest, place=self._ids[node[first]],
         )  # fmt: skip
 
-    def _rows_between(self, times: StepTimes, messages: Messages) -> tuple[Rows, Rows]:
+    def _rows_between(
+        self, times: StepTimes, messages: Messages
+    ) -> tuple[UnorderedRows, UnorderedRows]:
         """Return rows of slow messages and of lives until the block ends; keep later ones."""
         until, part = self._ends_of_parts(times)
         new = messages.of((messages.arrival > messages.sent) & (messages.outcome >= 0))
@@ -587,7 +591,7 @@ class SlotTables:
         lives, first = self.lives, self._lives_passed
         self._lives_passed = int(np.searchsorted(lives.t[: self._changes], until[-1], "right"))
         span = slice(first, self._lives_passed)
-        changes = Rows(
+        changes = UnorderedRows(
             part[np.searchsorted(until, lives.t[span])], lives.t[span], lives.kind[span],
             self._ids[lives.node[span]], place=lives.node[span],
         )  # fmt: skip
@@ -629,7 +633,7 @@ class SlotTables:
         before = np.searchsorted(part[order], sampled * self._parts + last, side="right")
         return table, before
 
-    def _stops(self, slot: IntArray, times: StepTimes) -> Rows:
+    def _stops(self, slot: IntArray, times: StepTimes) -> UnorderedRows:
         """Return the rows of nodes that stop in these slots (N,) of the block."""
         # A node stops by permanently freezing its network estimate, after it absorbed.
         node = np.flatnonzero((slot >= 0) & (slot < len(times.start)))
@@ -637,7 +641,9 @@ class SlotTables:
         slot, step = slot[node], self._setup.stages.stopping
         part, closes = self._part_of(slot, step) + 2, times.end[slot, step]
         phase, ids = self._phase[step], self._ids[node]
-        return Rows(part, closes, STOP, ids, phase=phase, place=ids, number=np.iinfo(int).max)
+        return UnorderedRows(
+            part, closes, STOP, ids, phase=phase, place=ids, number=np.iinfo(int).max
+        )
 
 
 @once_per_scenario
@@ -653,12 +659,12 @@ def _first_messages(scenario: Scenario) -> tuple[list[Transmission], FloatArray 
     return first, delivery_table(scenario, channel.loss, directions)
 
 
-def _chosen(rows: Rows, chosen: np.ndarray) -> Rows:
+def _chosen(rows: UnorderedRows, chosen: np.ndarray) -> UnorderedRows:
     columns = (c[chosen] if isinstance(c, np.ndarray) else c for c in rows)
-    return Rows(*columns)
+    return UnorderedRows(*columns)
 
 
-def _whole(rows: Rows) -> list[np.ndarray]:
+def _whole(rows: UnorderedRows) -> list[np.ndarray]:
     return [np.broadcast_to(column, len(rows.part)) for column in rows]
 
 

@@ -21,16 +21,16 @@ from netkf.algorithms.kernels.root_flow import (
     condition_root,
     information_rate,
     offset_of_F,
+    predict_root_lanes,
     propagate_mean,
     propagate_root,
     takes_one_step,
     trace_of_root,
-    transform_root,
     use_moments,
     width_of,
 )
 from netkf.engines.compiled.events import store_sample
-from netkf.engines.compiled.increments import advance_over_interval, next_interval, noise_index
+from netkf.engines.compiled.increments import next_interval, noise_index, predict_over_interval
 from netkf.engines.compiled.lane_readings import (
     LaneReadings,
     begin_reading,
@@ -452,7 +452,7 @@ def begin_interval(state: Simulation, visits: Visits, q: int) -> None:
         assign_lane(visits, SENSING, q, place, v, m, now, end)
     else:
         visits.places[SENSING, q] = NO_NODE
-        advance_over_interval(state, visit.run, h, place, visit.piece, now, end)
+        predict_over_interval(state, visit.run, h, place, visit.piece, now, end)
     # The rest of the gap is queued: its next interval depends on the covariance after this one.
     if end < time:
         queue_interval(state, visits, place, v, end, least)
@@ -633,7 +633,7 @@ def predict_lanes(state: Simulation, visits: Visits, reads: bool) -> None:
     moved = local_lanes_vector(size, MANY, visits.moved)
     propagate_mean(MANY, size, visits.x, values, moved)
     cholesky_in_lanes(MANY, size, T, values)
-    transform_root(MANY, size, S, values, offset_of_F(n, reads), V, T)
+    predict_root_lanes(MANY, size, S, values, offset_of_F(n, reads), V, T)
     for i in range(n):
         for j in range(i + 1):
             store(MANY, visits.S, i, j, load(MANY, S, i, j))

@@ -220,7 +220,7 @@ class Node:
         """Begin again at ``time`` seconds with the estimate ``fresh(time)``, of a slot in slots."""
         self.state = self.algorithm.init(self.model, *fresh(time), self.info)
 
-    def _advance(self, start: float, gap: float) -> None:
+    def _predict(self, start: float, gap: float) -> None:
         """Predict the filter over ``gap`` seconds from ``start`` on."""
         if isinstance(self.model, DrivenModel):
             self.state = self.model.advance(self.algorithm, self.state, start, gap)
@@ -410,7 +410,7 @@ class ClockedNode(Node):
         if isinstance(self.moving_model, ChangingFlowModel | RateModel):
             self.moving_model.move_to(time)
         if not self._increments:
-            self._advance(self._now, time - self._now)
+            self._predict(self._now, time - self._now)
             self._now = time
             return
         # A lower bound: a diverging covariance would make intervals ever shorter.
@@ -424,7 +424,7 @@ class ClockedNode(Node):
                 min_interval *= LONGER
             # Predict first: the increments of a gap are an observation at its end.
             gap = end - self._now
-            self._advance(self._now, gap)
+            self._predict(self._now, gap)
             moments = self._read(self._now, end)
             # The two moments of the increments, with the gains for a gap of this length.
             self.state = self.algorithm.update(self.state, Increments(moments, gap))

@@ -176,7 +176,7 @@ class SlotNode(Node):
             self._slot = slot + self._timing.predicts
             # A filtered estimate is of the slot before.
             start = self._schedule.start(slot - (not self._timing.predicts))
-            self._advance(start, self._period)
+            self._predict(start, self._period)
         elif stage.kind == "update":
             self._update(stage.time)
         else:

@@ -73,7 +73,7 @@ class ClockColumns(LoggedColumns):
         )
         self.estimators = self._filters.estimators
         self._clocks = node_times(scenario, Streams(run.seed, run.replica))
-        self._times = [self._shown(h, 0.0) for h in range(self.estimators)]
+        self._times = [self._clock_reading(h, 0.0) for h in range(self.estimators)]
         super().__init__()
         self._now = 0.0
         self._free = list(range(self._filters.messages))[::-1]
@@ -139,7 +139,7 @@ class ClockColumns(LoggedColumns):
         elif kind == ABSORB and node in self._inboxes:
             self._absorb(node, time)
         elif kind in (RESTART, JOIN) and node in self._forgetful:
-            self._times[self._index[node]] = self._shown(self._index[node], time)
+            self._times[self._index[node]] = self._clock_reading(self._index[node], time)
             self._filters.restart(self._index[node], self._scenario.prior_shift(node, time))
 
     def _move_truth(self, time: float) -> None:
@@ -190,21 +190,21 @@ class ClockColumns(LoggedColumns):
     def _gap(self, h: int, time: float) -> float:
         """Return the seconds, of its clock, over which to predict node h to ``time``."""
         self._move_increments(time)
-        shown = self._shown(h, time)
+        shown = self._clock_reading(h, time)
         self._filters.run.now = shown
         gap, self._times[h] = shown - self._times[h], shown
         return gap
 
-    def _shown(self, h: int, time: float) -> float:
+    def _clock_reading(self, h: int, time: float) -> float:
         """Return what the clock of node h shows at ``time``, both in seconds."""
         clock = self._clocks.get(self._scenario.nodes[h])
         return time if clock is None else clock.shows(time)
 
     def _stamped_age(self, h: int, message: Sent, time: float) -> float:
         """Return the age that the stamp of a message tells node h at ``time``."""
-        instant, shown = self._scenario.time_grid.instant, self._shown(h, time)
-        told = instant(shown - self._shown(message.sender, message.time))
-        return min(max(told, 0.0), instant(shown - self._shown(h, 0.0)))
+        instant, shown = self._scenario.time_grid.instant, self._clock_reading(h, time)
+        told = instant(shown - self._clock_reading(message.sender, message.time))
+        return min(max(told, 0.0), instant(shown - self._clock_reading(h, 0.0)))
 
     def _sense(self, h: int, time: float) -> None:
         observation: Observation | None = self._samples.get(time, {}).pop(h, None)

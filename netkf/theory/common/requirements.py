@@ -26,7 +26,7 @@ which are those of the plant after all its changes.
 """
 
 
-def require_scenario(functions: dict[str, Any]) -> dict[str, Any]:
+def guard_functions(functions: dict[str, Any]) -> dict[str, Any]:
     """Return ``functions`` by name, each of which refuses anything but a Scenario first."""
     wrapped = {}
     for name, function in functions.items():

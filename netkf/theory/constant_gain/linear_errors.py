@@ -26,7 +26,7 @@ def link_weights(scenario: Scenario) -> dict[tuple[int, int], FloatArray]:
     return {(i, j): scenario.weight(j, i) * eye for i, j in scenario.topology.directions}
 
 
-def slot_jumps(scenario: Scenario) -> SlotJumps:
+def constant_gain_jumps(scenario: Scenario) -> SlotJumps:
     """Return the errors in slots as a linear system; raises TheoryError for recorded exchanges."""
     gains, n = _node_gains(scenario), scenario.plant.n
     sensors = [scenario.observation_matrices(node) for node in scenario.nodes]

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.kernels.riccati import RiccatiFlow, move_covariances, riccati_flow
+from netkf.algorithms.kernels.riccati import RiccatiFlow, flow_covariance, move_covariances
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
@@ -168,7 +168,7 @@ def _solve_uncoupled(equations: CoupledRiccati, times: FloatArray) -> FloatArray
         for k, t in enumerate(times.tolist()):
             gap = t - now
             if gap not in flows:
-                flows[gap] = riccati_flow(equations.A, equations.Q, equations.G[nodes[0]], gap)
+                flows[gap] = flow_covariance(equations.A, equations.Q, equations.G[nodes[0]], gap)
             P[k, nodes] = present = move_covariances(flows[gap], present)
             now = t
     return P

@@ -20,7 +20,7 @@ from netkf.theory.common.random_links import all_messages_arrive, directions_of
 from netkf.theory.intermittent.riccati import steady_covariance
 
 
-def slot_jumps(scenario: Scenario) -> SlotJumps:
+def consensus_jumps(scenario: Scenario) -> SlotJumps:
     """Return the errors of Kalman-consensus filters at steady gains as a linear system. Raises
     TheoryError for recorded exchanges, and for shared readings with losses.
     """

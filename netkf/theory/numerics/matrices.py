@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import scipy
 
+from netkf.algorithms.kernels.riccati import flow_covariance as flow_over
 from netkf.algorithms.kernels.riccati import move_covariances
-from netkf.algorithms.kernels.riccati import riccati_flow as flow_over
 from netkf.core.errors import TheoryError
 from netkf.core.printable import MAX_RUNS
 from netkf.linalg.arrays import (

@@ -71,7 +71,7 @@ class ScheduleColumns(SlotColumns):
 
     def _observe(self, slot: int) -> dict[int, Observation]:
         used = [
-            observation if (slot, h) in self._sent else silence(observation, self._Y)
+            observation if (slot, h) in self._sent else silent_observation(observation, self._Y)
             for h, observation in self._each(slot).items()
             if len(observation.H)
         ]
@@ -84,7 +84,7 @@ def _with_one_filter(scenario: Scenario) -> Scenario:
     return replace(scenario, filter=filtering)
 
 
-def silence(reading: Observation, Y: float | FloatArray) -> Observation:
+def silent_observation(reading: Observation, Y: float | FloatArray) -> Observation:
     """Return the observation that a node's silence is to others: its H, with noise R + Y^-1."""
     R = silence_noise(reading.R, Y)
     # The true noise, whose root the reading has, may differ from the believed R.
@@ -139,7 +139,7 @@ def expected_sends(scenario: Scenario, run: Run) -> tuple[int, float]:
                 count += (slot, k) in sent
                 expected += trigger_rate(P, H, R, trigger_matrix(Y, len(R)))
         for k, observation in sensors.items():
-            used = observation if (slot, k) in sent else silence(observation, Y)
+            used = observation if (slot, k) in sent else silent_observation(observation, Y)
             P = joseph_update(P, used)
         slot += 1
     return count, expected

@@ -12,7 +12,7 @@ import scipy.stats
 import netkf
 from netkf.checks.evidence import BROKEN, HOLDS, judge
 from netkf.checks.laws import find
-from netkf.checks.parts.events import _places
+from netkf.checks.parts.events import _entity_indices
 from netkf.checks.parts.noises import start_states
 from netkf.checks.parts.rows import part_promises
 from netkf.checks.parts.samples import stack_parts, summarise_parts
@@ -444,5 +444,5 @@ def test_rows_of_ids_find_their_entities():
         rows[:, ::50] = missing
         known = {entity: k for k, entity in enumerate(entities)}
         expected = [known.get((int(i), int(j)), -1) for i, j in rows.T]
-        np.testing.assert_array_equal(_places(entities, list(rows)), expected)
-    np.testing.assert_array_equal(_places([(3,), (9,)], [np.array([9, 4, 3])]), [1, -1, 0])
+        np.testing.assert_array_equal(_entity_indices(entities, list(rows)), expected)
+    np.testing.assert_array_equal(_entity_indices([(3,), (9,)], [np.array([9, 4, 3])]), [1, -1, 0])
