@@ -24,7 +24,7 @@ from netkf.laws.losses import (
 from netkf.laws.noise import compare_with
 from netkf.laws.stating import stated_law, stated_part, stating_class
 from netkf.network.channels import BroadcastSampler, Channel, ChannelSampler, conditions_of
-from netkf.network.delays import Delay
+from netkf.network.delays import Delay, checked_delays
 from netkf.network.delays import delay_depends_on_message as overrides_message_delay
 from netkf.network.graphs import Complete, Link, Topology
 from netkf.network.losses import (
@@ -80,7 +80,8 @@ def check_channel(channel: Any, /, topology: Topology | None = None, **settings:
     the graph's table have equal ones, unless the class defines a ``mean_delivery`` of its own;
     ``conditions``, ``next_state`` and ``draw`` use only the generator they are given, and the last
     two make the same draws in each call, none if ``stateful`` is False or the delay is ``fixed``;
-    delays are not negative, at most ``longest``, and equal to ``fixed`` if it is not None.
+    delays are not negative, at most ``longest``, and equal to ``fixed`` if it is not None; those of
+    many messages at once are those of each, if the class is ``vectorised``.
 
     Statistical checks find these errors with probability 0.9. From 20,000 messages over each
     directed link: a delivered fraction p of one link that differs from ``mean_delivery`` by
@@ -385,6 +386,14 @@ def _check_message_delays(watched: WatchedPart, links: tuple[Link, ...]) -> None
         second = part.message_delay(call, drawn_delay)
         is_equal = second == first or (math.isnan(second) and math.isnan(first))
         watched.demand(method, is_equal, rule, f"{first:g} and {second:g}")
+    rule = "must give many messages the delays of each, where the class is vectorised"
+    for link, expected in zip(links, np.reshape(delays, (len(links), -1)), strict=True):
+        many, drawn = Transmission(link, np.array(MESSAGES)), np.full(len(MESSAGES), drawn_delay)
+        with guard_user_code(f"{watched.name}.{method}"):
+            together = checked_delays(part, many, drawn)
+        off = np.flatnonzero((together != expected) & ~(np.isnan(together) & np.isnan(expected)))
+        got = "".join(f"{together[k]:g} and {expected[k]:g}" for k in off[:1])
+        watched.demand(method, not off.size, rule, got, "use operations of numpy on whole arrays")
 
 
 def _draw(watched: WatchedPart, random: RecordingGenerator) -> float:

@@ -134,6 +134,29 @@ class Hidden(Delay):
         return float(np.random.default_rng().random())
 
 
+@says(
+    CHANNELS,
+    "AllAsTheFirst.delivery_probability: must give many messages the probabilities of each",
+)
+class AllAsTheFirst(Loss):
+    vectorised = True
+
+    def delivery_probability(self, sent):
+        return np.full(np.shape(sent.number), 1.0 / (1.0 + np.ravel(sent.number)[0]))[()]
+
+
+@says(CHANNELS, "AllSlow.message_delay: must give many messages the delays of each")
+class AllSlow(Delay):
+    vectorised = True
+    is_random = False
+
+    def draw(self, random):
+        return 0.0
+
+    def message_delay(self, sent, drawn):
+        return drawn + 0.1 * float(np.max(sent.number) > 5)
+
+
 @says(CLOCKS, "Halting.ticks: times must be above 0 and increase")
 class Halting(LinkClock):
     def ticks(self, link, origin, index, now, random, count):
