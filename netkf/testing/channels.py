@@ -401,9 +401,9 @@ def _draw(watched: WatchedPart, random: RecordingGenerator) -> float:
     rule, remedy = "must be a finite number of at least 0 seconds", "shift or clip the law"
     is_right = is_number(seconds) and 0.0 <= seconds < math.inf
     watched.demand("draw", is_right, rule, seconds, remedy)
+    is_fixed, got = fixed is None or seconds == fixed, f"{fixed} for {seconds}"
+    watched.demand("fixed", is_fixed, "must be what draw returns, or None", got)
     longest = watched.part.longest
     rule, remedy = f"must be at most `longest`, {longest:g} seconds", "state a longer one"
     watched.demand("draw", seconds <= longest, rule, seconds, remedy)
-    is_fixed, got = fixed is None or seconds == fixed, f"{fixed} for {seconds}"
-    watched.demand("fixed", is_fixed, "must be what draw returns, or None", got)
     return float(seconds)
