@@ -92,7 +92,7 @@ class ChannelStreams(NamedTuple):
     source : (W,), stream of each direction, within a run
     per_run : S
     delivery : (2, W), delivery probabilities in the good and the bad state of the link
-    chances : the delivery probabilities of a KernelLoss
+    delivery_laws : the delivery probabilities of a KernelLoss
     loss, state, delay : (R S, WIDTH), states of the random streams; (0, WIDTH): nothing is drawn
     bad : (R S,), state of each link (1: bad), -1 at first
     to_bad, to_good : transition probabilities of that state
@@ -104,7 +104,7 @@ class ChannelStreams(NamedTuple):
     source: IntArray
     per_run: int
     delivery: FloatArray
-    chances: DeliveryLaws
+    delivery_laws: DeliveryLaws
     loss: np.ndarray
     state: np.ndarray
     delay: np.ndarray
@@ -171,24 +171,24 @@ def delivery_probability_of(
     channels: ChannelStreams, run: int, w: int, bad: int, t: float
 ) -> float:
     """Return the delivery probability of the next message on direction ``w``, sent at ``t``."""
-    if channels.chances.address == 0:
+    if channels.delivery_laws.address == 0:
         return float(channels.delivery[bad, w])
-    return _delivery_by_law(channels.chances, run, w, t)
+    return _delivery_by_law(channels.delivery_laws, run, w, t)
 
 
 @kernel
-def _delivery_by_law(chances: DeliveryLaws, run: int, w: int, t: float) -> float:
-    k, message = run * len(chances.first) + w, chances.message
+def _delivery_by_law(laws: DeliveryLaws, run: int, w: int, t: float) -> float:
+    k, message = run * len(laws.first) + w, laws.message
     for i in range(len(message)):
-        message[i] = chances.first[w, i]
-    message[NUMBER], chances.out[0] = chances.sent[k], math.nan
-    call_function(chances.address, message, chances.settings, t, 0.0, chances.out)
-    chance = chances.out[0]
-    if not 0.0 <= chance <= 1.0 and chances.wrong[0] < 0.0:
-        chances.wrong[0], chances.wrong[1] = w, chances.sent[k]
-        chances.wrong[2], chances.wrong[3] = t, chance
-    chances.sent[k] += 1
-    return float(chance)
+        message[i] = laws.first[w, i]
+    message[NUMBER], laws.out[0] = laws.sent[k], math.nan
+    call_function(laws.address, message, laws.settings, t, 0.0, laws.out)
+    probability = laws.out[0]
+    if not 0.0 <= probability <= 1.0 and laws.wrong[0] < 0.0:
+        laws.wrong[0], laws.wrong[1] = w, laws.sent[k]
+        laws.wrong[2], laws.wrong[3] = t, probability
+    laws.sent[k] += 1
+    return float(probability)
 
 
 @kernel
@@ -393,7 +393,7 @@ def channel_streams(
         source=senders.source,
         per_run=len(sources),
         delivery=delivery,
-        chances=_delivery_laws(loss, first, streams.runs),
+        delivery_laws=_delivery_laws(loss, first, streams.runs),
         loss=none if listed or loss.deterministic else streams.states("loss", sources),
         state=streams.states("weather", sources) if loss.stateful and not listed else none,
         delay=streams.states("delay", sources) if delay.is_random and not listed else none,
@@ -430,7 +430,7 @@ def _delivery_laws(loss: Loss, first: Sequence[Transmission], runs: int) -> Deli
 
 def demand_probabilities(loss: Loss, channels: ChannelStreams, directions: Sequence[Link]) -> None:
     """Raise ScenarioError if a KernelLoss gave a message a probability outside [0, 1]."""
-    w, number, time, value = channels.chances.wrong.tolist()
+    w, number, time, value = channels.delivery_laws.wrong.tolist()
     if w >= 0.0:
         sent = Transmission(directions[int(w)], number=int(number), time=time)
         demand_probability(loss, sent, np.array(value))

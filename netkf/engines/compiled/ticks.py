@@ -571,7 +571,7 @@ class Schedule:
         clocks, channels = self._clocks, self._channels
         states: list[np.ndarray] = [clocks.next_tick, clocks.number, clocks.streams]
         states += [channels.loss, channels.state, channels.delay, channels.bad, channels.following]
-        states += [channels.chances.sent]
+        states += [channels.delivery_laws.sent]
         # Copies of the streams: an attempt that runs out of space starts again from them.
         copies = [state.copy() for state in states]
         # Space for the mean plus eight standard deviations of a Poisson count; in the rare case of
