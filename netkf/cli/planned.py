@@ -9,7 +9,6 @@ import argparse
 import contextlib
 import filecmp
 import io
-import shlex
 import sys
 import time
 from bisect import bisect_right
@@ -91,7 +90,7 @@ def work_on_study(plan: Plan, part: Part, pool: PoolOptions, options: argparse.N
             try:
                 gaps = _missing_runs(study_options.run, study_options, study, pool)
             except KeyboardInterrupt:
-                remedy = f"; go on with netkf work {shlex.quote(str(plan.directory))}"
+                remedy = f"; go on with {plan.work_command}"
                 raise InterruptedRunError(plan.directory, remedy) from None
             waits = bool(rounds and gaps and not worker.left and options.seconds is not None)
             if not waits or time.monotonic() + WAIT_SECONDS > worker.deadline:
@@ -253,7 +252,7 @@ def print_missing(plan: Plan, gaps: list[Gap], rounds: bool = False) -> None:
         done = [(part, 1) for part in set(range(plan.tasks)) - _missing_parts(short, plan.tasks)]
         array = ",".join(map(_describe_range, missing_ranges(done, range(plan.tasks))))
         again = f", or submit these of its {plan.tasks:,} jobs again: --array={array}"
-    print(f"go on with netkf work {shlex.quote(str(plan.directory))}{again}")
+    print(f"go on with {plan.work_command}{again}")
 
 
 def _missing_parts(gaps: list[Gap], tasks: int) -> set[int]:

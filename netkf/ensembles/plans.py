@@ -53,6 +53,11 @@ class Plan(NamedTuple):
     is_merged: bool
     arguments: Sequence[str] = ()
 
+    @property
+    def work_command(self) -> str:
+        """The command that works on it, as a shell reads it."""
+        return shlex.join(["netkf", "work", str(self.directory)])
+
 
 def plan_ensemble(
     scenario: Scenario,
@@ -167,7 +172,7 @@ def work_on_plan(
         ):
             replicate_blocks(task, merge, scenario, identity.runs, pool=workers, store=store)
     except KeyboardInterrupt:
-        remedy = f"; go on with netkf work {shlex.quote(str(plan.directory))}"
+        remedy = f"; go on with {plan.work_command}"
         raise InterruptedRunError(plan.directory, remedy) from None
     return WorkDone(replicas, worker.simulated, worker.left)
 

@@ -124,9 +124,9 @@ class CentralModel:
         self.variances = tuple(_plant_variances(central)) + tuple(_sensor_variances(central))
         self._lay_rows(central, got)
         self._lay_laws(central, got.times)
-        _, S = self.innovations(np.ones(len(self.variances)))
+        self._stated = self.innovations(np.ones(len(self.variances)))
         # In units of the noise S is at least 1.
-        largest = float(np.max(abs(self.y) / np.sqrt(np.maximum(S, 1.0))))
+        largest = float(np.max(abs(self.y) / np.sqrt(np.maximum(self._stated[1], 1.0))))
         if largest * ROUNDING * BLUR > 1.0:
             rule, remedy = "give readings too large for rounding to leave", "shorten the horizon"
             raise ScenarioError("sensors", f"{rule} their noise", largest, remedy)
@@ -208,7 +208,7 @@ class CentralModel:
 
     def as_innovations(self) -> Innovations:
         """Return the innovations of scalar readings, each given those before it."""
-        v, S = self.innovations(np.ones(len(self.variances)))
+        v, S = self._stated
         rows = np.ones(len(v), dtype=np.int64)
         parts = v / np.sqrt(S), v * self._scales, np.sqrt(S) * self._scales
         whitened, values, deviations = (list(part[:, None]) for part in parts)

@@ -23,6 +23,7 @@ from netkf.laws.losses import (
 )
 from netkf.laws.noise import compare_with
 from netkf.laws.stating import stated_law, stated_part, stating_class
+from netkf.linalg.arrays import FloatArray
 from netkf.network.channels import BroadcastSampler, Channel, ChannelSampler, conditions_of
 from netkf.network.delays import Delay, checked_delays
 from netkf.network.delays import delay_depends_on_message as overrides_message_delay
@@ -198,15 +199,22 @@ def _check_pure(watched: WatchedPart, sent: list[Transmission]) -> None:
     for call, first, second in zip(calls, forwards, backwards, strict=True):
         got = f"{first:.4g} and {second:.4g} for message {call.number} of link {list(call.link)}"
         watched.demand(method, first == second, rule, got, remedy)
-    rule = "must give many messages the probabilities of each, where the class is vectorised"
     for one, expected in zip(sent, np.reshape(forwards, (len(sent), -1)), strict=True):
         number, time, bad = np.transpose([(m.number, m.time, m.bad) for m in _messages(one)])
         many = one._replace(number=number.astype(int), time=time, bad=bad.astype(bool))
         with guard_user_code(f"{watched.name}.{method}"):
             together = delivery_probabilities(watched.part, many)
-        off = np.flatnonzero(together != expected)
-        got = "".join(f"{together[k]:.4g} and {expected[k]:.4g}" for k in off[:1])
-        watched.demand(method, not off.size, rule, got, "use operations of numpy on whole arrays")
+        _demand_each(watched, method, "probabilities", together, expected)
+
+
+def _demand_each(
+    watched: WatchedPart, method: str, what: str, together: FloatArray, expected: FloatArray
+) -> None:
+    """Demand that many messages ``together`` (K,) have what each of them has, ``expected``."""
+    off = np.flatnonzero((together != expected) & ~(np.isnan(together) & np.isnan(expected)))
+    rule = f"must give many messages the {what} of each, where the class is vectorised"
+    got = "".join(f"{together[k]:.4g} and {expected[k]:.4g}" for k in off[:1])
+    watched.demand(method, not off.size, rule, got, "use operations of numpy on whole arrays")
 
 
 def _check_identical_links(watched: WatchedPart, sent: list[Transmission]) -> None:
@@ -386,14 +394,11 @@ def _check_message_delays(watched: WatchedPart, links: tuple[Link, ...]) -> None
         second = part.message_delay(call, drawn_delay)
         is_equal = second == first or (math.isnan(second) and math.isnan(first))
         watched.demand(method, is_equal, rule, f"{first:g} and {second:g}")
-    rule = "must give many messages the delays of each, where the class is vectorised"
     for link, expected in zip(links, np.reshape(delays, (len(links), -1)), strict=True):
         many, drawn = Transmission(link, np.array(MESSAGES)), np.full(len(MESSAGES), drawn_delay)
         with guard_user_code(f"{watched.name}.{method}"):
             together = checked_delays(part, many, drawn)
-        off = np.flatnonzero((together != expected) & ~(np.isnan(together) & np.isnan(expected)))
-        got = "".join(f"{together[k]:g} and {expected[k]:g}" for k in off[:1])
-        watched.demand(method, not off.size, rule, got, "use operations of numpy on whole arrays")
+        _demand_each(watched, method, "delays", together, expected)
 
 
 def _draw(watched: WatchedPart, random: RecordingGenerator) -> float:
