@@ -139,13 +139,13 @@ def find_checks(scenario: Scenario) -> PaperChecks:
     """Return the checks of the paper of a scenario's filter; raises TheoryError without one."""
     if not scenario.is_linear:
         return WITHOUT_PAPER
-    # Papers are about plants that do not change, are drawn and are estimated whole; the equations
-    # hold for all.
-    whole = scenario.views is None or have_one_view(scenario)
+    # Papers are about plants that do not change and are drawn, and most about nodes that estimate
+    # them whole; the equations hold for all.
     changes = len(scenario.plant.changes) or not scenario.is_random or scenario.network.lives
-    if changes or not whole:
-        return UNDER_CLOCKS
     promised = promised_filter(scenario.filter.algorithm)
+    in_parts = scenario.views is not None and not have_one_view(scenario)
+    if changes or (in_parts and promised.analysis.paper not in OF_EQUATIONS):
+        return UNDER_CLOCKS
     # Without messages the equations of a Kalman filter are all that is promised.
     known = promised.analysis.paper in OF_PAPERS
     if not promised.timing.talks or (takes_columns(promised) and not known):

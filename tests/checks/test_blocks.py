@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 import netkf
+from netkf.checks.check import find_checks
 from netkf.checks.evidence import BROKEN
-from tests.algorithms.test_block_intersection import CLOCKED, ROBOTS, load
+from tests.algorithms.test_block_intersection import BELIEF, CLOCKED, KEPT, ROBOTS, load
 
 BOUND = "P is at least the covariance of the error, given the events"
 
@@ -33,3 +34,13 @@ def test_overconfident_filters_of_blocks_are_found_and_no_others(
     assert rows["P follows the equations along the events of each run"].verdict == "holds"
     assert rows["files hold the run, and the summary counts it"].verdict == "holds"
     assert rows["estimates, covariances and weights begin as [filter] says"].verdict == "holds"
+
+
+@pytest.mark.parametrize("text", [ROBOTS, CLOCKED], ids=["slots", "clocks"])
+@pytest.mark.parametrize("kind", [KEPT, BELIEF], ids=lambda kind: kind["kind"])
+def test_what_papers_say_of_blocks_is_promised(
+    tmp_path: Path, text: str, kind: dict[str, object]
+) -> None:
+    scenario = load(text, tmp_path, filter=kind | {"estimates": "own"})
+    names = [promise.statement for promise in find_checks(scenario).promises(scenario)]
+    assert "P is the covariance of the error, given the events" in names
