@@ -24,6 +24,7 @@ from netkf.logs import outcomes as stats
 from netkf.logs.envelope import COLUMNS, FittedLaw, Interval, compare_with_laws
 from netkf.logs.outcomes import LogOutcomes, Test, make_outcomes
 from netkf.logs.packets import UNREPORTED, parse_numbers, read_text_rows
+from netkf.network.delays import ExponentialDelay, LognormalDelay, UniformDelay
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.runs.files import write_text
 from netkf.scenario.reading import load
@@ -39,6 +40,7 @@ ASSUMPTIONS = {
     "channel": "channels have one delivery",
     "directions": "both directions have one delivery",
     "distance": "the distance decides the delivery",
+    "delay": "delays are independent and have the likeliest law",
 }
 NEEDS = {
     "bernoulli": ("links", "time", "fate", "constancy", "channel"),
@@ -60,12 +62,16 @@ MAKERS = {
     "channel": "hopping",
     "directions": "per-link",
     "distance": "per-link",
+    "delay": "recorded delays",
 }
 """Laws that do without an assumption."""
 MAYBE = 0.05
 """Below this p a departure is allowed for in other tests, whether it is there or not."""
 SAME_DELAY = 1e-9
 """Standard deviation of the logarithms of delays below which all are the same."""
+MAX_LOG = 600.0
+"""Logarithm of the largest mean of delays: that of a law without a mean to speak of."""
+DELAYS = {"lognormal": LognormalDelay, "exponential": ExponentialDelay, "uniform": UniformDelay}
 KEY = ["sender", "receiver", "message"]
 UNKNOWN, REPLAY = "unknown.csv", "fit_replay.csv"
 FILES = ("fit_links.csv", "fit_tests.csv", "fit_laws.csv", FIT_FILE)
@@ -153,7 +159,8 @@ def fit_log(
     outcomes = make_outcomes(table)
     distance = _distances(scenario, outcomes, table)
     tests, share, time, edges = run_tests(outcomes, distance)
-    tests |= channels
+    delay, delay_test = _fit_delays(scenario, table, notes)
+    tests |= channels | delay_test
     level = (1.0 - confidence) / max(sum(np.isfinite(t.p) for t in tests.values()), 1)
     test_table = _test_table(tests, level)
     rejected = {key for key, test in tests.items() if test.p < level}
@@ -183,7 +190,7 @@ def fit_log(
             f"shared fate of hearers: {share.value:.3f} +- {share.error:.3f}; {share.lasting:.3f} "
             "of it lasts to the next transmission (slow changes, or shared bursts)"
         )
-    envelope, delay = pd.DataFrame(), _delay_table(scenario, table, notes)
+    envelope = pd.DataFrame()
     if runs is None or runs > 0:
         replay = _complete_replay(folder, scenario, table, links, notes)
         pool = PoolOptions(workers=workers)
@@ -548,36 +555,45 @@ def _law_table(
     return pd.DataFrame(rows, columns=columns)
 
 
-def _delay_table(scenario: Scenario, table: pd.DataFrame, notes: list[str]) -> dict[str, Any]:
-    """Return a delay law in place of a recorded one: that of a lost message is in no record."""
+def _fit_delays(
+    scenario: Scenario, table: pd.DataFrame, notes: list[str]
+) -> tuple[dict[str, Any], dict[str, Test]]:
+    """Return a delay law in place of a recorded one, and its test, or {} each: delays of lost
+    messages are in no record.
+    """
     delay = scenario.network.channel.delay
     if not isinstance(delay, RecordedDelay):
-        return {}
+        return {}, {}
     listed = delay.rows[delay.rows < scenario.horizon]
     seconds = listed[listed > 0.0]
     if not len(seconds):
-        return {"kind": "none"}
+        return {"kind": "none"}, {}
     heard = table[table["delivered"] == 1].get("delay", pd.Series(dtype=float))
     if at_once := int((pd.to_numeric(heard, errors="coerce") == 0.0).sum()):
         notes.append(
             f"{at_once:,} of {at_once + len(seconds):,} delays are 0, below the resolution of the "
             "stamps: the law of delays is that of the others"
         )
-    mean, sigma = float(seconds.mean()), float(np.log(seconds).std())
+    logs = np.log(seconds)
+    mean, sigma = float(seconds.mean()), float(logs.std())
     if sigma < SAME_DELAY:
         notes.append(f"delays: all are {mean:.3g} s")
-        return {"kind": "constant", "seconds": mean}
+        return {"kind": "constant", "seconds": mean}, {}
     low, high, count = float(seconds.min()), float(seconds.max()), len(seconds)
     second = 0.5 * math.log(count)  # what a second parameter costs, as in bic
-    lognormal = -count * math.log(sigma * math.sqrt(2.0 * math.pi * math.e)) - second
+    lognormal = -count * math.log(sigma * math.sqrt(2.0 * math.pi * math.e)) - logs.sum() - second
+    likeliest = math.exp(min(float(logs.mean()) + 0.5 * sigma**2, MAX_LOG))
     _, kind, values = max(
-        (lognormal - float(np.log(seconds).sum()), "lognormal", {"mean": mean, "sigma": sigma}),
+        (float(lognormal), "lognormal", {"mean": likeliest, "sigma": sigma}),
         (-count * (1.0 + math.log(mean)), "exponential", {"mean": mean}),
         (-count * math.log(high - low) - second, "uniform", {"low": low, "high": high}),
     )
     told = ", ".join(f"{key} {value:.3g}" for key, value in values.items())
     notes.append(f"delays (s): likeliest of exponential, lognormal and uniform is {kind}, {told}")
-    return {"kind": kind, **values}
+    law = DELAYS[kind](**values).law
+    if law is None or at_once:
+        return {"kind": kind, **values}, {}
+    return {"kind": kind, **values}, {"delay": stats.test_law(ASSUMPTIONS["delay"], seconds, law)}
 
 
 def _write(

@@ -17,8 +17,9 @@ import numpy as np
 import pandas as pd
 from scipy.optimize import brentq, minimize
 from scipy.special import expit, logit
-from scipy.stats import beta, chi2, ncx2, norm
+from scipy.stats import beta, chi2, kstwo, ncx2, norm
 
+from netkf.core.laws import WaitingLaw
 from netkf.linalg.arrays import FloatArray
 
 POWER = 0.9
@@ -66,6 +67,23 @@ class Test(NamedTuple):
 
         noncentrality = float(brentq(miss, 1e-6, 100.0 * (limit + 10.0)))
         return self.unit * float(noncentrality ** (1.0 / self.power))
+
+
+def test_law(assumption: str, values: FloatArray, law: WaitingLaw) -> Test:
+    """Return the test that independent ``values`` (K,) have a ``law`` that was fitted to them: by
+    Kolmogorov and Smirnov, whose p is then too large, never too small.
+    """
+    found, counts = np.unique(values, return_counts=True)
+    # Stamps do not tell more than the shortest gap between two values.
+    step = float(np.diff(found).min(initial=np.inf))
+    up_to = np.cumsum(counts) / len(values)
+    above = up_to - law.cdf(found + step)
+    below = law.cdf(np.maximum(found - step, 0.0)) - (up_to - counts / len(values))
+    distance = float(max(above.max(), below.max(), 0.0))
+    # Of a normal law with this standard error about as much is found as of Kolmogorov's.
+    unit = 0.62 / math.sqrt(len(values))
+    what = "distance of distribution functions"
+    return Test(assumption, what, distance, float(kstwo.sf(distance, len(values))), unit)
 
 
 class Group(NamedTuple):

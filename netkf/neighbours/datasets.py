@@ -54,6 +54,8 @@ def to_xarray(result: Run | Ensemble) -> Any:
         text = to_toml({**resolve_defaults(scenario), "seed": result.seed})
         about = "the scenario, without the files that it names"
         variables["scenario"] = (), text, {"long_name": about}
+        labels = {"long_name": "name and unit of the state"}
+        coordinates["state_label"] = ("state",), np.array(scenario.state_labels[:n]), labels
         coordinates |= _coordinates_of_nodes(scenario, is_run)
     if isinstance(result, Run):
         attributes |= {

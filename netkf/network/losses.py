@@ -372,11 +372,12 @@ class GilbertElliott(Loss):
                 )
         # The means imply to_bad = mean_loss / (1 - mean_loss) / mean_burst, which may exceed 1.
         if self.transitions[0] > 1.0:
+            shortest = math.ceil(1e6 * self.transitions[0] * (self.mean_burst or 0.0)) / 1e6
             raise ScenarioError(
                 "mean_burst",
                 "is too short for that mean_loss",
                 self.mean_burst,
-                "lengthen the bursts or lower the loss",
+                f"lengthen the bursts to at least {shortest:g}, or lower the loss",
             )
 
     @property

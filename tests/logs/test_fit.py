@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.optimize
+import scipy.stats
 
 import netkf
 from netkf.cli.main import main
@@ -428,15 +429,34 @@ def test_delays_of_one_length_are_constant_and_those_of_none_are_counted(tmp_pat
     ],
 )
 def test_delays_have_the_law_they_were_drawn_from(tmp_path, law):
-    random, rows = np.random.default_rng(1), ["t,sender,receiver,number,heard,t_heard"]
+    random = np.random.default_rng(1)
     kind, *values = law.values()
     if kind == "lognormal":
         values[0] = np.log(values[0]) - 0.5 * values[1] ** 2
-    delays = getattr(random, kind)(*values, size=400)
-    rows += [f"{k},a,b,{k},1,{k + delay:.9f}" for k, delay in enumerate(delays)]
-    (tmp_path / "log.csv").write_text("\n".join(rows))
-    netkf.import_log(tmp_path / "log.csv", "csv", tmp_path / "made")
-    found = netkf.fit_log(tmp_path / "made", runs=0)
+    found = _fit_of_delays(tmp_path, getattr(random, kind)(*values, size=400))
     delay = as_table(netkf.load(found.scenarios["bernoulli"]))["network"]["channel"]["delay"]
     assert delay.pop("kind") == kind
     assert delay == pytest.approx({key: law[key] for key in delay}, rel=0.1)
+    assert found.tests.set_index("key").loc["delay", "verdict"] == "not rejected"
+
+
+@pytest.mark.parametrize("digits", [9, 2])
+def test_delays_of_another_law_are_told(tmp_path, digits):
+    """Most of them short, some long, as with a retransmission."""
+    random = np.random.default_rng(1)
+    again = np.where(random.random(400) < 0.2, 0.3, 0.0)
+    delays = np.round(again + random.uniform(0.1, 0.2, 400), digits)
+    row = _fit_of_delays(tmp_path, delays).tests.set_index("key").loc["delay"]
+    law = scipy.stats.lognorm(np.log(delays).std(), scale=np.exp(np.log(delays).mean()))
+    assert row["verdict"] == "rejected"
+    if digits == 9:
+        distance, p = scipy.stats.kstest(delays, law.cdf)
+        assert (row["estimate"], row["p"]) == pytest.approx((distance, p), rel=1e-3)
+
+
+def _fit_of_delays(folder, delays):
+    rows = [f"{k},a,b,{k},1,{k + delay:.9f}" for k, delay in enumerate(delays)]
+    text = "\n".join(["t,sender,receiver,number,heard,t_heard", *rows])
+    (folder / "log.csv").write_text(text)
+    netkf.import_log(folder / "log.csv", "csv", folder / "made")
+    return netkf.fit_log(folder / "made", runs=0)

@@ -22,6 +22,7 @@ def test_a_dataset_has_what_the_run_has(run):
     assert float(one.xhat.sel(state=1)) == row.xhat1
     assert float(one.P.sel(state=0, other_state=1)) == row.P01
     assert (float(one.node_x), float(one.node_y)) == (3.0, 4.0)
+    assert tuple(dataset.state_label.values) == run.scenario.state_labels
     np.testing.assert_array_equal(dataset.error.isel(node=k), run.x - run.xhat[:, k])
     kinds = dict(
         zip(

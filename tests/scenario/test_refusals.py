@@ -562,7 +562,7 @@ CHANNELS = [
         "gilbert-short",
         loss("gilbert-elliott", "mean_loss = 0.9, mean_burst = 1.0"),
         f"{L}.mean_burst",
-        "too short for that mean_loss; got 1.0",
+        "too short for that mean_loss; got 1.0; lengthen the bursts to at least 9,",
     ),
     (
         "gilbert-all",

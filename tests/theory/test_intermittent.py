@@ -57,6 +57,7 @@ def test_critical_probability_with_its_certificates(name):
     F, H = np.array(system["A"]), np.array(system["C"])
     found = theory.critical_certificate(F, H)
     assert theory.critical_probability(F, H) == (found.lower, found.upper)
+    assert found.lower <= found.upper
     assert found.lower == pytest.approx(case["lower_31"], abs=1e-12)
     assert found.upper == pytest.approx(case["upper_closed_form"] or case["upper_32"], abs=1e-10)
     # the gain proves the bound from above
@@ -83,6 +84,12 @@ def test_two_decoupled_plants_are_as_critical_as_the_worse():
     both = theory.critical_probability(F, H)
     # the readings arrive together, so the bound is the larger of the two
     assert both[1] == pytest.approx(max(upper for _, upper in alone), abs=1e-9)
+
+
+@pytest.mark.parametrize("mode", np.linspace(1.0, 3.0, 30).tolist())
+def test_the_bounds_on_the_critical_probability_of_one_mode_are_in_order(mode):
+    lower, upper = theory.critical_probability([[mode]], [[1.0]])
+    assert lower <= upper == pytest.approx(1.0 - mode**-2, abs=1e-15)
 
 
 def test_critical_probability_of_a_system_as_large_as_numbers_go():

@@ -239,7 +239,8 @@ def _critical_bounds(F: FloatArray, H: FloatArray, search: _GainSearch) -> tuple
     if np.linalg.matrix_rank(relative / _row_sizes(relative)[:, None]) == 1:
         # Closed form for one output: 1 - 1 / (product of the squares of unstable eigenvalues).
         growing = np.maximum(moduli, 1.0)
-        return lower, float(-np.expm1(-2.0 * np.log(growing).sum()))
+        upper = float(-np.expm1(-2.0 * np.log(growing).sum()))
+        return lower, max(lower, upper)  # equal, but for rounding, if one mode grows
     # The lower bound suffices: both bounds are equal, and the radius has no root above it.
     if radius(lower) <= 1.0 + 1e-13:
         return lower, lower
