@@ -14,6 +14,7 @@ from netkf.core.printable import count_phrase
 from netkf.ensembles.monte_carlo import Ensemble
 from netkf.ensembles.summary import mean_bounds
 from netkf.linalg.arrays import FloatArray
+from netkf.runs.quantities import traffic
 from netkf.runs.run import CompletedRun
 from netkf.runs.summary import (
     NO_COVARIANCE,
@@ -222,7 +223,9 @@ def _reduce_run(run: Run) -> FigureData:
         "delivered": run.count("deliver"),
         "lost": run.count("lost") + run.count("late"),
     }
-    summary = stored_summary or summarise(run.scenario, sink, promised, messages)
+    summary = stored_summary or summarise(
+        run.scenario, sink, promised, messages, traffic(run.scenario, sink.transmissions)
+    )
     return collect_figure_data(
         run.scenario, sink, promised, summary, seed=run.seed, status=run.status, run=run
     )

@@ -9,7 +9,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.collections import LineCollection
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from netkf.figures.figure_data import FigureData
 from netkf.figures.layout import Positions, get_positions
@@ -51,7 +51,7 @@ def network_figure(data: FigureData) -> Picture:
     for axes, (label, values) in zip(panels, quantities.items(), strict=True):
         draw_network(axes, data, values, label, positions)
     panels[0].legend(loc="upper left", bbox_to_anchor=(0.0, 0.0), ncols=2)
-    finish_figure(figure, data.title(_make_headline(data)), data.caption(_explain_widths(data)))
+    finish_figure(figure, data.title(_make_headline(data)), data.caption(*explain_network(data)))
     return figure
 
 
@@ -72,30 +72,24 @@ def _colour_quantities(data: FigureData) -> dict[str, dict[int, float]]:
     key, label = error_label(data)
     quantities = {label: node_values(data, key)}
     if data.runs == 1 and any("sent" in row for row in data.node_averages):
-        kilobytes = {node: size / 1000.0 for node, size in _message_bytes(data).items()}
         quantities["messages sent, all hearers counted"] = node_values(data, "sent")
-        transmissions = node_values(data, "transmissions")
-        quantities["kilobytes transmitted"] = {
-            node: count * kilobytes[node] for node, count in transmissions.items()
-        }
+        sizes = node_values(data, "bytes")
+        if not all(map(math.isnan, sizes.values())):  # the scenario may not ask for them
+            label = "kilobytes transmitted, broadcasts once"
+            quantities[label] = {node: size / 1000.0 for node, size in sizes.items()}
     return quantities
 
 
-def _message_bytes(data: FigureData) -> dict[int, int]:
-    sizes = data.scenario.sizes.tolist()
-    return {node: 8 * (n + n * (n + 1) // 2) for node, n in zip(data.nodes, sizes, strict=True)}
-
-
-def _explain_widths(data: FigureData) -> str:
-    sizes = sorted(set(_message_bytes(data).values()))
-    size = f"{sizes[0]}" if len(sizes) == 1 else f"{sizes[0]} .. {sizes[-1]}"
-    links = "Links are as wide as the messages that they delivered. " if data.delivered else ""
+def explain_network(data: FigureData) -> list[str]:
+    """Return sentences on what a network that is drawn shows."""
+    sentences = []
+    if data.delivered:
+        sentences.append("Links are as wide as the messages that they delivered.")
+    if data.scenario.positions.moving:
+        sentences.append("Nodes are where they begin.")
     if len(data.scenario.topology.links) > MAX_LINKS:
-        links += f"{MAX_LINKS:,} links are drawn. "
-    energy = (
-        f"A transmission counts {size} bytes, an estimate with its covariance; a broadcast once."
-    )
-    return links + (energy if data.runs == 1 else "")
+        sentences.append(f"{MAX_LINKS:,} links are drawn.")
+    return sentences
 
 
 def _make_headline(data: FigureData) -> str:
@@ -152,7 +146,8 @@ def draw_network(
         bar.ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.4g}"))
         finite = {value for value in values.values() if math.isfinite(value)}
         if len(finite) > 1:
-            bar.ax.locator_params(nbins=5)
+            whole = all(map(float.is_integer, finite))
+            bar.ax.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10], integer=whole))
         else:  # a scale without length has one tick
             bar.set_ticks([*finite], labels=[f"{value:.4g}" for value in finite])
 
@@ -185,7 +180,8 @@ def _draw_nodes(
 ) -> Any:
     """Draw the nodes by ``values``, white where nan; return what the colour bar shows, or None."""
     finite = [value for value in values.values() if math.isfinite(value)]
-    low, high = (min(finite), max(finite)) if finite else (0.0, 1.0)
+    # Of both groups: a bar widens the scale of what it shows where all values are one.
+    scale = mpl.colors.Normalize(*((min(finite), max(finite)) if finite else (0.0, 1.0)))
     dots = None
     for group, marker, label in (
         (~data.has_sensor, "o", "without a sensor"),
@@ -200,8 +196,7 @@ def _draw_nodes(
             c=[values.get(n, math.nan) for n in nodes],
             marker=marker,
             cmap=mpl.colormaps[SEQUENTIAL].with_extremes(bad="white"),
-            vmin=low,
-            vmax=high,
+            norm=scale,
             s=_dot_area(data),
             edgecolors=INK,
             linewidths=0.5,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from netkf.ensembles.directory import FinishedEnsemble
 from netkf.figures.figure_data import FigureData, reduce_completed_run, reduce_ensemble
-from netkf.figures.network import draw_network, error_label, node_values
+from netkf.figures.network import draw_network, error_label, explain_network, node_values
 from netkf.figures.panels import draw_covariances, draw_errors, draw_nees
 from netkf.figures.style import (
     Picture,
@@ -64,8 +64,7 @@ def _caption_sentences(data: FigureData) -> list[str]:
     sentences = []
     if data.runs > 1:
         sentences.append("Bands: 95% intervals of the means (1.96 standard errors).")
-    if data.delivered:
-        sentences.append("Links are as wide as the messages that they delivered.")
+    sentences += explain_network(data)
     messages = data.messages
     if messages.get("sent"):
         sent = f"{messages['sent']:,.0f} messages"

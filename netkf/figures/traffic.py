@@ -305,6 +305,7 @@ def _draw_shares(
         axes.set_xlabel("direction, sender > receiver")
     else:
         axes.set_xlabel(f"{len(directions)} directions, in the order of their share")
+        axes.locator_params(axis="x", integer=True)
     axes.set_ylabel("share of messages delivered")
     draw_legend(axes)
     return misses

@@ -83,6 +83,25 @@ def sample_quantities(scenario: Scenario, squares: FloatArray) -> FloatArray:
     return found
 
 
+def traffic(scenario: Scenario, transmissions: Transmissions) -> FloatArray:
+    """Return NETWORK (N + 1, 6) of nodes and of all, but for ages and connection, which are nan."""
+    found = np.full((len(scenario.nodes) + 1, len(NETWORK)), np.nan)
+    radio, energy = scenario.network.radio or Radio(), scenario.network.energy or Energy()
+    found[:-1, 3:] = 0.0
+    for phase, counts in transmissions.by_phase(scenario.nodes):
+        sizes = [
+            scenario.message_size(node, phase) if count else 0.0
+            for node, count in zip(scenario.nodes, counts, strict=True)
+        ]
+        spent = {size: _joules(energy, size, radio.frames(size)) for size in set(sizes)}
+        costs = [(1.0, size, spent[size]) for size in sizes]
+        found[:-1, 3:] += np.array(counts)[:, None] * np.array(costs)
+    found[-1, 3:] = found[:-1, 3:].sum(axis=0)
+    if scenario.network.energy is None:
+        found[:, 5] = np.nan
+    return found
+
+
 class NetworkSink(Sink):
     """Follows ages, connection and traffic of run ``replica`` of ``seed``.
 
@@ -126,7 +145,7 @@ class NetworkSink(Sink):
         ends with its last event.
         """
         scenario = self._scenario
-        found = np.full((len(scenario.nodes) + 1, len(NETWORK)), np.nan)
+        found = traffic(scenario, self._transmissions)
         if self._ages is not None:
             mean, worst = self._ages.finish(scenario.horizon if complete else self._last)
             known = np.isfinite(mean).any(axis=1)
@@ -136,19 +155,6 @@ class NetworkSink(Sink):
                 found[-1, :2] = np.nanmean(found[:-1, 0]), np.nanmax(found[:-1, 1])
         self.connectivity.finish()
         found[:, 2] = self.connectivity.shares()
-        radio, energy = scenario.network.radio or Radio(), scenario.network.energy or Energy()
-        found[:-1, 3:] = 0.0
-        for phase, counts in self._transmissions.by_phase(scenario.nodes):
-            sizes = [
-                scenario.message_size(node, phase) if count else 0.0
-                for node, count in zip(scenario.nodes, counts, strict=True)
-            ]
-            spent = {size: _joules(energy, size, radio.frames(size)) for size in set(sizes)}
-            costs = [(1.0, size, spent[size]) for size in sizes]
-            found[:-1, 3:] += np.array(counts)[:, None] * np.array(costs)
-        found[-1, 3:] = found[:-1, 3:].sum(axis=0)
-        if scenario.network.energy is None:
-            found[:, 5] = np.nan
         return found
 
 

@@ -349,3 +349,40 @@ def test_the_names_of_nodes_on_a_circle_stand_outside_of_it():
     for text in axes.texts[:9]:
         box = text.get_window_extent().transformed(axes.transData.inverted())
         assert np.hypot(*np.mean([box.min, box.max], axis=0)) > np.hypot(*text.xy)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "changes"),
+    [
+        ("gossip_ring", {"horizon": 20.0, "network.quantise": {"bits": 8, "range": 50.0}}),
+        ("push_sum_planar", {"horizon": 10.0}),
+        ("intermittent_random10", {"horizon": 10.0, "network.radio": {"bytes_per_number": 4}}),
+    ],
+)
+def test_bytes_of_a_picture_are_those_of_the_summary(scenario, changes, tmp_path):
+    """Of messages as the filter sends them, not of an estimate with its covariance."""
+    scenario = netkf.load(SCENARIOS / f"{scenario}.toml", changes)
+    run = netkf.simulate(scenario)
+    netkf.save(run, scenario, tmp_path / "kept")
+    kept = netkf.open(tmp_path / "kept")
+    stated = sorted(row["bytes"] / 1000.0 for row in kept.summary["nodes"])
+    for result in (run, kept):
+        shown = [value for dots in kilobytes(result) for value in dots.get_array()]
+        assert sorted(shown) == pytest.approx(stated)
+
+
+def kilobytes(run):
+    """Return the dots of a run in the last panel of its network, by group of nodes."""
+    figure = run.plot("network")
+    assert figure.axes[-1].get_xlabel() == "kilobytes transmitted, broadcasts once"
+    figure.canvas.draw()
+    return [c for c in figure.axes[2].collections if isinstance(c, mpl.collections.PathCollection)]
+
+
+def test_equal_values_have_one_colour():
+    """With a sensor and without one: all ten nodes send as many bytes."""
+    run = netkf.simulate(netkf.load(SCENARIOS / "push_sum_planar.toml", {"horizon": 10.0}))
+    both = kilobytes(run)
+    assert len(both) == 2
+    assert len({value for dots in both for value in dots.get_array()}) == 1
+    assert len({tuple(color) for dots in both for color in dots.get_facecolors()}) == 1
