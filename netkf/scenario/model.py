@@ -775,7 +775,14 @@ class ScenarioModel(Component):
         """Return the share of messages of a link that arrive in the long run; nan if unknown."""
         if self.topology.radius is not None or self.network_changes:
             return math.nan
-        return self.network.channel.mean_delivery(self.transmission(link))
+        if link not in self._mean_deliveries:
+            mean = self.network.channel.mean_delivery(self.transmission(link))
+            self._mean_deliveries[link] = mean
+        return self._mean_deliveries[link]
+
+    @cached_property
+    def _mean_deliveries(self) -> dict[Link, float]:
+        return {}
 
     @cached_property
     def increment_sensors(self) -> dict[int, tuple[PlacedSensor, ...]]:

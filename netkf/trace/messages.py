@@ -32,6 +32,7 @@ sent_row, end_row: rows of both events in the log, -1 for a message under way.
 """
 OUTCOMES = {CODES["deliver"]: DELIVERED, CODES["lost"]: LOST, CODES["late"]: LATE}
 """Outcomes by the codes of their events."""
+_OUTCOME_OF_KIND = np.array([OUTCOMES.get(code, UNDER_WAY) for code in range(max(OUTCOMES) + 1)])
 
 
 def join_messages(log: np.ndarray) -> np.ndarray:
@@ -41,49 +42,44 @@ def join_messages(log: np.ndarray) -> np.ndarray:
     ``log`` (E,) are the EVENT rows of the run. Raises ValueError if an outcome belongs to no send
     event.
     """
-    rows = np.flatnonzero(np.isin(log["kind"], [CODES["send"], *OUTCOMES]))
-    events = np.take(log, rows)
-    ended = events["kind"] != CODES["send"]
+    kind, send = log["kind"], CODES["send"]
+    sends, ends = np.flatnonzero(kind == send), np.flatnonzero(np.isin(kind, [*OUTCOMES]))
     # A loss is an event of the sender, an arrival one of the receiver.
-    of_sender = ~ended | (events["kind"] == CODES["lost"])
-    sender = np.where(of_sender, events["node"], events["peer"])
-    receiver = np.where(of_sender, events["peer"], events["node"])
-    order = _order_by(sender, receiver, events["message"], ended)
-    events, rows, ended = np.take(events, order), rows[order], ended[order]
-    sends = np.flatnonzero(~ended)
+    node, peer, is_lost = log["node"][ends], log["peer"][ends], kind[ends] == CODES["lost"]
+    sender, receiver = np.where(is_lost, node, peer), np.where(is_lost, peer, node)
+    columns = {name: log[name][sends] for name in ("node", "peer", "message")}
+    key, end_key = _keys(
+        (columns["node"], sender),
+        (columns["peer"], receiver),
+        (columns["message"], log["message"][ends]),
+    )
+    order, end_order = np.argsort(key, kind="stable"), np.argsort(end_key, kind="stable")
+    key, end_key, sends, ends = key[order], end_key[end_order], sends[order], ends[end_order]
     messages = np.zeros(len(sends), dtype=MESSAGE)
-    columns = {"sender": sender[order], "receiver": receiver[order], "number": events["message"]}
-    for name, column in columns.items():
-        messages[name] = column[sends]
-    messages["sent"], messages["phase"] = events["t"][sends], events["phase"][sends]
-    messages["sent_row"] = rows[sends]
+    for name, column in zip(("sender", "receiver", "number"), columns.values(), strict=True):
+        messages[name] = column[order]
+    messages["sent"], messages["phase"] = log["t"][sends], log["phase"][sends]
     messages["ended"] = messages["age"] = np.nan
-    messages["outcome"], messages["end_row"] = UNDER_WAY, -1
-    # The event of an outcome directly follows that of its message.
-    ends = np.flatnonzero(ended)
-    follows = ~ended[ends - 1] if len(sends) else np.zeros(len(ends), dtype=bool)
-    for column in columns.values():
-        follows &= column[ends] == column[ends - 1]
-    if not follows.all() or (len(ends) and not ends[0]):
+    messages["outcome"], messages["sent_row"], messages["end_row"] = UNDER_WAY, sends, -1
+    k = np.searchsorted(key, end_key, side="right") - 1
+    if (k < 0).any() or (key[k] != end_key).any() or (np.diff(end_key) == 0).any():
         raise ValueError("an outcome belongs to no message")
-    k = np.cumsum(~ended)[ends] - 1
-    messages["ended"][k], messages["age"][k] = events["t"][ends], events["age"][ends]
-    for code, outcome in OUTCOMES.items():
-        messages["outcome"][k[events["kind"][ends] == code]] = outcome
-    messages["end_row"][k] = rows[ends]
+    messages["ended"][k], messages["age"][k] = log["t"][ends], log["age"][ends]
+    messages["outcome"][k], messages["end_row"][k] = _OUTCOME_OF_KIND[kind[ends]], ends
     return messages
 
 
-def _order_by(*keys: np.ndarray) -> IntArray:
-    """Return the order (K,) of rows by integer ``keys`` (K,), the first one first."""
-    sizes = [int(key.max(initial=0)) + 1 for key in keys]
-    if math.prod(sizes) >= 1 << 62 or min(int(key.min(initial=0)) for key in keys) < 0:
-        return np.lexsort(keys[::-1])
-    # As one number they are sorted once, not key by key.
-    number = np.zeros(len(keys[0]), dtype=np.int64)
-    for key, size in zip(keys, sizes, strict=True):
-        number = number * size + key
-    return np.argsort(number, kind="stable")
+def _keys(*pairs: tuple[np.ndarray, np.ndarray]) -> tuple[IntArray, IntArray]:
+    """Return the rows of two tables as integers in their order, from both of each column."""
+    columns = [np.concatenate(pair).astype(np.int64) for pair in pairs]
+    sizes = [int(column.max(initial=0)) + 1 for column in columns]
+    if math.prod(sizes) >= 1 << 62 or min(int(column.min(initial=0)) for column in columns) < 0:
+        columns = [np.unique(column, return_inverse=True)[1] for column in columns]
+        sizes = [int(column.max(initial=0)) + 1 for column in columns]
+    total = np.zeros(len(columns[0]), dtype=np.int64)
+    for column, size in zip(columns, sizes, strict=True):
+        total = total * size + column
+    return total[: len(pairs[0][0])], total[len(pairs[0][0]) :]
 
 
 def by_link(messages: np.ndarray) -> Iterator[np.ndarray]:
