@@ -203,5 +203,6 @@ def _draw_nodes(
             zorder=2,
             label=label,
             plotnonfinite=True,
+            clip_on=False,  # an equal aspect may leave a marker at the rim no room
         )
     return dots if finite else None

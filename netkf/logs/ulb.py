@@ -75,7 +75,7 @@ def read_ulb(log: Path) -> PacketLog:
         sends[["sender", "t", "channel", "to", "sent", "logged"]],
         outcomes,
         origin,
-        find_resolution(stamps),
+        find_resolution([*stamps, *read_stamps]),
         "unknown",
         notes,
     )

@@ -386,3 +386,4 @@ def test_equal_values_have_one_colour():
     assert len(both) == 2
     assert len({value for dots in both for value in dots.get_array()}) == 1
     assert len({tuple(color) for dots in both for color in dots.get_facecolors()}) == 1
+    assert not any(dots.get_clip_on() for dots in both)  # whole at the rim of their panel

@@ -430,13 +430,15 @@ def test_tables_of_ulb_name_motes_and_times(tmp_path, readings, heard, rule):
 def test_ulb_counts_missing_reports_as_unknown(tmp_path):
     log = tmp_path / "log"
     log.mkdir()
-    rows = [f"{60 * m + 10 + i},{i},20.5,50" for m in range(3) for i in (1, 2, 3)]
+    rows = [f"{60 * m + 10 + i}.25,{i},20.5,50" for m in range(3) for i in (1, 2, 3)]
     write(log / "readings.csv", ["t_s,node,temperature_c,humidity_pct", *rows])
     # Reports of minutes 0, 1, 2 by 2; of 0 and 2 by 3, which hears 1 in minute 0 only.
     reports = [*("60.5,2,1,99", "120.5,2,1,99", "180.5,2,1,90", "60.7,3,1,80"), "180.7,3,2,70"]
     write(log / "heard.csv", ["t_s,receiver,sender,lqi", *reports, "180.9,3,2,70"])
     netkf.import_log(log, "ulb", tmp_path / "out")
     accounts = table(tmp_path / "out", "accounts.csv").set_index(["sender", "receiver"])
+    report = (tmp_path / "out" / "report.txt").read_text()
+    assert "resolution: stamps are multiples of 0.01 s" in report  # those of readings too
     assert accounts.loc[(1, 2)].tolist() == [3, 3, 0, 0]
     assert accounts.loc[(1, 3)].tolist() == [3, 1, 1, 1]
     assert accounts.loc[(2, 3)].tolist() == [3, 1, 1, 1]
