@@ -63,7 +63,6 @@ from netkf.scenario.registry import kind_name
 from netkf.scenario.scenario import Scenario
 from netkf.theory import assumptions
 from netkf.theory.common.blocks import have_one_view, run_of_view, scenario_of_view
-from netkf.theory.common.columns import has_columns
 from netkf.theory.common.evidence import CONSISTENCY, LIVES
 from netkf.trace.nees import without_padding
 from netkf.trace.run import Run
@@ -139,12 +138,12 @@ def find_checks(scenario: Scenario) -> PaperChecks:
     """Return the checks of the paper of a scenario's filter; raises TheoryError without one."""
     if not scenario.is_linear:
         return WITHOUT_PAPER
-    # Papers are about plants that do not change and are drawn, and most about nodes that estimate
-    # them whole; the equations hold for all.
+    # Papers are about plants that do not change and are drawn, nodes that are up, and most about
+    # nodes that estimate the whole state; the equations, and what they say of P, hold for all.
     changes = len(scenario.plant.changes) or not scenario.is_random or scenario.network.lives
     promised = promised_filter(scenario.filter.algorithm)
     in_parts = scenario.views is not None and not have_one_view(scenario)
-    if changes or (in_parts and promised.analysis.paper not in OF_EQUATIONS):
+    if (changes or in_parts) and promised.analysis.paper not in OF_EQUATIONS:
         return UNDER_CLOCKS
     # Without messages the equations of a Kalman filter are all that is promised.
     known = promised.analysis.paper in OF_PAPERS
@@ -455,14 +454,6 @@ def _require_laws(scenario: Scenario) -> None:
             raise TheoryError(f"{evidence}, so nothing is promised; {CONSISTENCY}")
         if scenario.network.lives:
             raise TheoryError(f"{LIVES}, and {evidence}, so nothing is promised; {CONSISTENCY}")
-    if scenario.network.lives and not (
-        scenario.is_linear and has_columns(scenario) and scenario.views is None
-    ):
-        rule = (
-            "what is promised then can be checked where dynamics and readings are linear, all "
-            "nodes estimate the same state, and the kernels of the filter are affine"
-        )
-        raise TheoryError(f"{LIVES}: {rule}; {CONSISTENCY}")
     if not nodes_with_law(scenario).any():
         raise TheoryError(
             "the state or the readings are recorded: there is one run, and no law to check; "

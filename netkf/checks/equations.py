@@ -77,15 +77,24 @@ UPPER_BOUND = Promise(
 EXACT = Promise(
     "P is the covariance of the error, given the events",
     "Bar-Shalom and Campo 1986",
-    (KNOWN, START, REACH),
+    (KNOWN, START, REACH, MEMORY),
     check_exact_covariance,
     exact=True,
 )
 
 
+def left_out(scenario: Scenario) -> tuple[Promise, ...]:
+    """Return a row on nodes whose errors have no law, as what they follow is recorded; or none."""
+    name, line = "errors of all blocks have a known law", unjudged_line(scenario)
+    return (Promise(name, "netkf", (), lambda *_: find_unknown(line)),) if line else ()
+
+
 def about_equations(*about_P: Promise, slots_only: bool = False) -> PaperChecks:
     """Return the checks of a filter's equations, and of promises about its P."""
-    return PaperChecks(lambda _: (FOLLOWS_EVENTS, *about_P, *ERRORS), slots_only=slots_only)
+    return PaperChecks(
+        lambda scenario: (FOLLOWS_EVENTS, *about_P, *ERRORS, *left_out(scenario)),
+        slots_only=slots_only,
+    )
 
 
 def design_of(scenario: Scenario) -> str:
@@ -125,18 +134,13 @@ def summarise_drift(scenario: Scenario, run: Run) -> ReplicaSummary:
 def _promises_under_clocks(scenario: Scenario) -> tuple[Promise, ...]:
     analysis, design = with_promised_filter(scenario).node_filter.analysis, design_of(scenario)
     conserved = analysis.conserved
-    # In slots mass is lost with messages, as P says, and who is down hears none; P may count
-    # readings of who is down, or one reading several times.
-    sleepy = scenario.slotted and bool(scenario.network.lives)
-    mass = () if conserved is nothing_conserved or sleepy else (MASS_CONSERVED,)
+    # In slots mass is lost with messages, as P says, and who is down hears none.
+    dissipates = scenario.slotted and bool(scenario.network.lives)
+    mass = () if conserved is nothing_conserved or dissipates else (MASS_CONSERVED,)
     # P of other papers' filters may leave something out (kcf), or is proved of one fusion (ici).
     proved = design in ("larger", "equal") or analysis.paper in ("", "gossip", "intermittent")
-    bound = (UPPER_BOUND,) if proved and design != "smaller" and not sleepy else ()
-    unjudged = unjudged_line(scenario)
-    left_out = Promise(
-        "errors of all blocks have a known law", "netkf", (), lambda *_: find_unknown(unjudged)
-    )
-    return (*mass, FOLLOWS_EVENTS, *bound, *ERRORS, *((left_out,) if unjudged else ()))
+    bound = (UPPER_BOUND,) if proved and design != "smaller" else ()
+    return (*mass, FOLLOWS_EVENTS, *bound, *ERRORS, *left_out(scenario))
 
 
 UNDER_CLOCKS = PaperChecks(_promises_under_clocks, summarise=summarise_drift)
@@ -158,7 +162,7 @@ def _summarise_bits(scenario: Scenario, run: Run) -> ReplicaSummary:
 BITS = Promise(
     "a bit lowers P by 2/pi of what its reading would, along the bits of each run",
     "Ribeiro et al. 2006",
-    (),
+    ("nodes are up",),
     check_replay,
     exact=True,
 )
@@ -189,7 +193,7 @@ OF_EQUATIONS = {
         replace(
             EXACT,
             source="Weiss and Freeman 2001, derived",
-            needs=(KNOWN, "the graph has no loops", START, REACH),
+            needs=(KNOWN, "the graph has no loops", START, REACH, MEMORY),
         )
     ),
     # Of two nodes P is the covariance of the error.
@@ -213,7 +217,7 @@ OF_EQUATIONS = {
         replace(
             UPPER_BOUND,
             source="Battistelli and Chisci 2014, derived",
-            needs=(KNOWN, "no reading counts more than once", "P_i(0) >=", REACH),
+            needs=(KNOWN, "no reading counts more than once", "P_i(0) >=", REACH, MEMORY),
         ),
         slots_only=True,
     ),

@@ -23,22 +23,22 @@ Key = tuple[int, int, int]
 """A reading: its number, the node that reads, and the node that is read."""
 LOSSY = {"loss": {"kind": "bernoulli", "delivery": 0.6}, "symmetric": False}
 DELAYED = LOSSY | {"delay": {"kind": "exponential", "mean": 0.6}}
-SLOTS = 1.0, 0.9, 0.2
-CLOCKS = 0.5, np.exp(-0.05), 0.25 * (1.0 - np.exp(-0.1)) / 0.2
-"""Seconds from reading to reading; transition and noise from one to the next."""
+SLOTS = 1.0, 0.9, 0.2, []
+CHANGING = 1.0, 0.9, 0.2, [{"from": 4.0, "F": [[0.6]]}]
+CLOCKS = 0.5, np.exp(-0.05), 0.25 * (1.0 - np.exp(-0.1)) / 0.2, []
+"""Seconds from reading to reading; transition and noise from one to the next; and changes."""
 
 
 def posterior(
-    known: set[Key], y: dict[Key, float], last: int, F: float, Q: float
+    known: set[Key], y: dict[Key, float], laws: list[tuple[float, float]]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and variance of all nodes at reading number ``last``, by one solution for all
-    instants; entry (k, i) of the state is k * N + i - 1.
+    """Return mean and variance of all nodes now, by one solution for all instants, with F and Q
+    from each to the next; entry (k, i) of the state is k * N + i - 1.
     """
-    variances = np.array(
-        [F ** (2 * k) + Q * sum(F ** (2 * s) for s in range(k)) for k in range(99)]
-    )
-    k = np.arange(last + 1)
-    C = variances[np.minimum.outer(k, k)] * F ** np.abs(np.subtract.outer(k, k))
+    C = np.eye(1)
+    for F, Q in laws:
+        row = F * C[-1]
+        C = np.block([[C, row[:, None]], [row, F * row[-1] + Q]])
     C = np.kron(C, np.eye(N))
     H, R = np.zeros((len(known), len(C))), np.zeros(len(known))
     for row, (k, i, j) in enumerate(sorted(known)):
@@ -90,17 +90,23 @@ def known_to_all(run: netkf.Run, y: dict[Key, float], period: float) -> dict[flo
 
 @pytest.mark.parametrize(
     ("text", "law", "steps", "channel"),
-    [(ROBOTS, SLOTS, 1, LOSSY), (ROBOTS, SLOTS, 2, LOSSY), (CLOCKED, CLOCKS, 1, DELAYED)],
-    ids=["slots", "two steps", "late and overtaken"],
+    [
+        (ROBOTS, SLOTS, 1, LOSSY),
+        (ROBOTS, SLOTS, 2, LOSSY),
+        (CLOCKED, CLOCKS, 1, DELAYED),
+        (ROBOTS, CHANGING, 1, LOSSY),
+    ],
+    ids=["slots", "two steps", "late and overtaken", "a plant that changes"],
 )
 def test_on_trees_it_is_the_posterior_of_what_has_arrived(
     tmp_path: Path,
     text: str,
-    law: tuple[float, float, float],
+    law: tuple[float, float, float, list[dict[str, object]]],
     steps: int,
     channel: dict[str, object],
 ) -> None:
-    random, (period, F, Q) = np.random.default_rng(1), law
+    random, (period, F, Q, schedule) = np.random.default_rng(1), law
+    laws = [(F, Q)] * 4 + [(0.6 if schedule else F, Q)] * READINGS
     keys = [(k, i, j) for k in range(1, READINGS + 1) for i in NEIGHBOURS for j in NEIGHBOURS[i]]
     keys += [(k, 1, 1) for k in range(1, READINGS + 1)]
     y = {key: float(random.normal()) for key in keys}
@@ -113,6 +119,7 @@ def test_on_trees_it_is_the_posterior_of_what_has_arrived(
     text = "\n".join(line for line in text.split("\n") if not line.startswith("sampling"))
     changes = {
         "plants__0__nodes": list(NEIGHBOURS),
+        "plants__0__schedule": schedule,
         "network__graph": {"kind": "edges", "edges": EDGES},
         "network__channel": channel,
         "horizon": period * (READINGS + 1),
@@ -124,7 +131,7 @@ def test_on_trees_it_is_the_posterior_of_what_has_arrived(
     # The last sample has events beyond the horizon, which are not recorded.
     for k, t in enumerate(run.times[:-1]):
         for i in range(N if k else 0):
-            x, P = posterior(known[round(t, 6)][i], y, k, F, Q)
+            x, P = posterior(known[round(t, 6)][i], y, laws[:k])
             np.testing.assert_allclose(run.xhat[k, i, 0], x[i], atol=1e-10)
             np.testing.assert_allclose(run.P[k, i, 0, 0], P[i], rtol=1e-9)
     assert run.count("lost") > 10

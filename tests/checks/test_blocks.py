@@ -11,6 +11,7 @@ from netkf.checks.check import find_checks
 from netkf.checks.evidence import BROKEN
 from tests.algorithms.test_block_intersection import BELIEF, CLOCKED, KEPT, ROBOTS, load
 
+CRASHES = [{"kind": "crashes", "nodes": [2], "mean_up": 1.5, "mean_down": 0.5}]
 BOUND = "P is at least the covariance of the error, given the events"
 
 
@@ -20,11 +21,12 @@ BOUND = "P is at least the covariance of the error, given the events"
         (CLOCKED, "block-intersection", {}),
         (ROBOTS, "block-intersection", {"filter__rule": "naive"}),
         (ROBOTS, "central", {"filter__estimates": "own+neighbours"}),
+        (CLOCKED, "block-belief-propagation", {"network__lives": CRASHES}),
     ],
-    ids=["split", "naive", "central"],
+    ids=["split", "naive", "central", "lives"],
 )
 def test_overconfident_filters_of_blocks_are_found_and_no_others(
-    tmp_path: Path, text: str, kind: str, changes: dict[str, str]
+    tmp_path: Path, text: str, kind: str, changes: dict[str, object]
 ) -> None:
     scenario = load(text, tmp_path, horizon=3.0, filter__kind=kind, **changes)
     verdict = netkf.check(scenario, runs=10)
@@ -36,11 +38,13 @@ def test_overconfident_filters_of_blocks_are_found_and_no_others(
     assert rows["estimates, covariances and weights begin as [filter] says"].verdict == "holds"
 
 
+@pytest.mark.parametrize("lives", [[], CRASHES], ids=["up", "lives"])
 @pytest.mark.parametrize("text", [ROBOTS, CLOCKED], ids=["slots", "clocks"])
 @pytest.mark.parametrize("kind", [KEPT, BELIEF], ids=lambda kind: kind["kind"])
 def test_what_papers_say_of_blocks_is_promised(
-    tmp_path: Path, text: str, kind: dict[str, object]
+    tmp_path: Path, text: str, kind: dict[str, object], lives: list[dict[str, object]]
 ) -> None:
-    scenario = load(text, tmp_path, filter=kind | {"estimates": "own"})
+    changes = {"filter": kind | {"estimates": "own"}, "network__lives": lives}
+    scenario = load(text, tmp_path, **changes)
     names = [promise.statement for promise in find_checks(scenario).promises(scenario)]
     assert "P is the covariance of the error, given the events" in names

@@ -589,8 +589,9 @@ def test_no_lives_is_todays_run(scenario_of):
 
 @pytest.mark.one_in(2)
 @pytest.mark.parametrize("memory", ["kept", "lost"])
-def test_check_holds_a_run_to_the_promises_that_survive(scenario_of, memory):
-    scenario = scenario_of(CLOCKS, *recorded(memory), filter_="hybrid")
+@pytest.mark.parametrize(("text", "filter_"), [(CLOCKS, "hybrid"), (SLOTS, "diffusion")])
+def test_check_holds_a_run_to_the_promises_that_survive(scenario_of, text, filter_, memory):
+    scenario = scenario_of(text, *recorded(memory), filter_=filter_)
     verdict = netkf.check(scenario, runs=20)
     assert verdict
     found = dict(verdict.table[["promise", "verdict"]].to_numpy().tolist())
@@ -725,6 +726,8 @@ def test_no_theory_counts_readings_of_nodes_that_are_down(scenario_of, text, tmp
     summary = json.loads((netkf.save(run, scenario, tmp_path / "run") / "summary.json").read_text())
     assert summary["central"] is None
     assert [node["bound"] for node in summary["nodes"]] == 3 * [None]
+    with pytest.raises(netkf.TheoryError, match="down at times"):
+        netkf.theory.information_level(scenario)
 
 
 def test_a_sweep_takes_wrong_clocks(scenario_of):

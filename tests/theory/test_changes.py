@@ -11,6 +11,7 @@ from scipy.linalg import expm, solve_discrete_are
 import netkf
 from netkf.checks.check import find_checks
 from netkf.core.errors import TheoryError
+from netkf.theory.one_bit.covariances import bit_covariances
 from netkf.theory.promises import compute_promises, promises_text
 from tests.engines.test_changes import (
     INCREMENTS,
@@ -27,6 +28,19 @@ from tests.engines.test_changes import (
 )
 
 UNAWARE = {"model": {"schedule": False}}
+INFORMATION = {"consensus": "information", "steps": 1}
+SAID_OF_P = {
+    "belief-propagation": {},
+    "consensus-innovations": {},
+    "event-triggered": {
+        "inner": {"kind": "hcmci", **INFORMATION},
+        "trigger": "consensus",
+        "thresholds": [0.5, 0.5],
+    },
+    "hcmci": INFORMATION,
+    "one-bit": {},
+}
+"""Filters of whose P papers say something that no change of the plant makes false, with options."""
 
 
 def gain(P):
@@ -209,6 +223,23 @@ def test_check_promises_no_bound_that_no_paper_proves(kind):
     promises = [one.statement for one in find_checks(s).promises(s)]
     assert "P follows the equations along the events of each run" in promises
     assert "P is at least the covariance of the error, given the events" not in promises
+
+
+@pytest.mark.parametrize("kind", SAID_OF_P)
+def test_check_promises_of_p_what_it_does_without_changes(kind):
+    s = slots(kind, filter=SAID_OF_P[kind])
+    now, before = (
+        [one.statement for one in find_checks(of).promises(of)] for of in (s, s.last_piece)
+    )
+    assert now == before
+    assert any(name.startswith(("P is", "a bit")) for name in now)
+
+
+def test_bits_lower_p_by_the_matrices_of_their_slots():
+    s = slots("one-bit")
+    run = netkf.simulate(s, engine="simpy")
+    # The last sample has bits of its own slot, which is not recorded.
+    np.testing.assert_allclose(bit_covariances(s, run)[:-1], run.P[:-1], rtol=1e-9)
 
 
 @pytest.mark.one_in(2)

@@ -20,6 +20,7 @@ from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sensors import LinearSensor
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
+from netkf.theory.common.evidence import require_every_reading
 from netkf.theory.numerics.matrices import as_integer, as_number
 
 if TYPE_CHECKING:
@@ -56,10 +57,12 @@ def information_level(
                      positive
     mean, mean_low, mean_high   mean of lambda_k over the pasts drawn, with its 99 % interval
 
-    As printed in D, h terms are divided by h + 1. Raises TheoryError for recorded sensors.
+    As printed in D, h terms are divided by h + 1. Raises TheoryError for recorded sensors, and for
+    nodes that are down at times.
     """
     import pandas as pd
 
+    require_every_reading(scenario)
     runs, seed = as_integer("runs", runs, 2), as_integer("seed", seed, 0, np.inf)
     window = None if window is None else as_integer("window", window, 1)
     sources = _make_sources(scenario)
