@@ -25,7 +25,7 @@ def _run(options: argparse.Namespace) -> int:
     fixed = [setting.partition("=")[0].strip() for setting in options.set]
     fixed += ["seed"] if options.seed is not None else []
     grid, scenario = parse_grid(options.vary, fixed), load_scenario(options)
-    draw = partial(pictures.draw_picture, pictures.SWEEP, scenario.name)
+    draw = partial(pictures.draw_picture, pictures.SWEEP, scenario)
     completed: list[CompletedSweep] = []
     try:
         with lock_directory(options.out), ProgressLine() as line:

@@ -127,7 +127,7 @@ class FigureSet:
         if self._envelope is not None:
             return envelope_figure(self._envelope)
         sweep = self._sweep
-        return sweep_figure(sweep.scenario.name, sweep.table, sweep.keys, sweep.status)
+        return sweep_figure(sweep.scenario, sweep.table, sweep.keys, sweep.status)
 
 
 def plot_to_files(result: Any, names: tuple[str, ...], out: Path, file_format: str) -> list[Path]:

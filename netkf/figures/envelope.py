@@ -34,6 +34,8 @@ def envelope_figure(table: Any) -> Picture:
         axes.plot(np.full(len(outside), replay), outside, "x", **style)
         axes.set_yticks(places, laws)
         axes.margins(x=0.12)
+        if own[["low", "high", "replay"]].stack().nunique() == 1:
+            axes.set_xlim(replay - 0.1, replay + 0.1)  # an axis over nothing has no scale
         axes.locator_params(axis="x", nbins=4)
         axes.set_ylim(len(laws) - 0.4, -0.6)
         axes.set_xlabel(quantity)

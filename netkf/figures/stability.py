@@ -127,12 +127,12 @@ def _map_stable(scenario: Scenario, rates: Sequence[float]) -> np.ndarray:
     return stable
 
 
-def sweep_figure(name: str, table: Any, keys: Sequence[str], status: str) -> Picture:
+def sweep_figure(scenario: Scenario, table: Any, keys: Sequence[str], status: str) -> Picture:
     """Draw the largest RMS error of a ``table`` of ``netkf.sweep`` over one or two keys, and mark
     points that diverged or have no bound. Raises UnavailableError for more keys, or without a
     point.
     """
-    points = f"{name}: {len(table)} points"
+    points = f"{scenario.name}: {len(table)} points"
     if status != "complete":
         points += f"; the sweep was {status}"
     runs = int(table["runs"].max()) if len(table) else 0
@@ -145,13 +145,13 @@ def sweep_figure(name: str, table: Any, keys: Sequence[str], status: str) -> Pic
     figure = new_figure(7.4, 4.6)
     axes = figure.add_subplot()
     draw = _draw_sweep_curves if len(keys) == 1 else _draw_sweep_map
-    draw(axes, table, list(keys))
+    draw(axes, table, list(keys), label_text(scenario.unit))
     prefix = "" if status == "complete" else "Interrupted: "
     finish_figure(figure, prefix + _describe_best(table, keys), caption)
     return figure
 
 
-def _draw_sweep_curves(axes: Any, table: Any, keys: list[str]) -> None:
+def _draw_sweep_curves(axes: Any, table: Any, keys: list[str], unit: str) -> None:
     positions, labels = _axis_positions(axes.set_xscale, table[keys[0]])
     order = np.argsort(positions, kind="stable")
     columns = (("worst_rms", "node with the largest error"), ("mean_rms", "all nodes"))
@@ -175,12 +175,12 @@ def _draw_sweep_curves(axes: Any, table: Any, keys: list[str]) -> None:
         # Long labels overlap unless they are tilted.
         rotation = 15 if sum(map(len, labels)) > 70 else 0
         axes.set_xticks(range(len(labels)), labels, rotation=rotation)
-    axes.set(xlabel=keys[0], ylabel="RMS error, units of the state")
+    axes.set(xlabel=keys[0], ylabel=f"RMS error, {unit}")
     axes.set_ylim(bottom=0.0)
     draw_legend(axes)
 
 
-def _draw_sweep_map(axes: Any, table: Any, keys: list[str]) -> None:
+def _draw_sweep_map(axes: Any, table: Any, keys: list[str], unit: str) -> None:
     x_values, y_values = (list(dict.fromkeys(table[key].tolist())) for key in keys)
     errors = np.full((len(y_values), len(x_values)), np.nan)
     diverged, unbounded = (np.zeros(errors.shape, dtype=bool) for _ in range(2))
@@ -204,7 +204,7 @@ def _draw_sweep_map(axes: Any, table: Any, keys: list[str]) -> None:
     axes.set_xticks(range(len(x_values)), [label_text(_format_value(value)) for value in x_values])
     axes.set_yticks(range(len(y_values)), [label_text(_format_value(value)) for value in y_values])
     axes.set(xlabel=keys[0], ylabel=keys[1])
-    axes.figure.colorbar(image, ax=axes, label="largest RMS error, units of the state")
+    axes.figure.colorbar(image, ax=axes, label=f"largest RMS error, {unit}")
     draw_legend(axes)
 
 
@@ -232,7 +232,9 @@ def _axis_positions(set_scale: Callable[[str], Any], values: Any) -> tuple[Float
 
 
 def _format_value(value: Any) -> str:
-    text = f"{value:.4g}" if isinstance(value, (int, float, np.number)) else str(value)
+    text = str(value)
+    if isinstance(value, (int, float, np.number)):
+        text = f"{value:.15g}" if float(value).is_integer() else f"{value:.4g}"
     return text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 3] + "..."
 
 
@@ -287,7 +289,7 @@ def law_figure(data: FigureData) -> Picture:
             # An axis over rounding errors would suggest a spread.
             axes.set_xlim(0.9 * low, 1.1 * high)
     axes.set_yscale("log")
-    axes.set(xlabel="trace of P, squared units of the state", ylabel="share of samples above")
+    axes.set(xlabel=f"trace of P, squared {data.unit}", ylabel="share of samples above")
     draw_legend(axes)
     note = "The first fifth of the samples is left out. Samples of one run are not independent."
     finish_figure(figure, data.title(headline), data.caption(note))

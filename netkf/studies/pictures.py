@@ -14,6 +14,7 @@ from netkf.figures.style import (
     LOG_RATIO,
     MUTED,
     finish_figure,
+    label_text,
     new_figure,
     style_context,
     write_figure,
@@ -30,11 +31,11 @@ PANELS = (
 )
 
 
-def sweep_picture(title: str, completed: CompletedSweep) -> bool:
+def sweep_picture(scenario: Scenario, completed: CompletedSweep) -> bool:
     """Write ``sweep.png`` and return True; False if more than two keys were varied."""
     try:
         with style_context():
-            figure = sweep_figure(title, completed.table, completed.keys, "complete")
+            figure = sweep_figure(scenario, completed.table, completed.keys, "complete")
     except UnavailableError:
         return False
     write_figure(figure, completed.directory / "sweep.png")
@@ -48,7 +49,8 @@ def filter_picture(scenario: Scenario, completed: CompletedComparison) -> None:
         figure = new_figure(9.6, 1.7 + 0.34 * len(rows))
         panels = figure.subplots(1, len(PANELS) + 1, sharey=True)
         for axes, (name, label) in zip(panels, PANELS, strict=False):
-            _draw_quantity(axes, rows, name, label)
+            unit = scenario.common_unit if name != "nees_ratio" else ""
+            _draw_quantity(axes, rows, name, label + (f", {label_text(unit)}" if unit else ""))
         kilobytes = [row.bytes / 1000.0 for row in rows]
         panels[-1].barh(range(len(rows)), kilobytes, height=0.5, color=MUTED)
         panels[-1].set_xlabel("kB sent in a run")

@@ -5,16 +5,20 @@ import itertools
 
 import matplotlib as mpl
 import numpy as np
+import pandas as pd
 import pytest
 
 import netkf
 from netkf.cli.main import main
+from netkf.ensembles.pools import PoolOptions
 from netkf.figures import plane
 from netkf.figures.catalogue import FIGURES, FigureSet, plot_to_files
+from netkf.figures.envelope import envelope_figure
 from netkf.figures.names import FIGURE_NAMES
 from netkf.figures.several import errors_figure
 from netkf.figures.style import style_context
 from netkf.runs.curves import ErrorCurve
+from netkf.studies.sweep import plan_sweep, sweep_to_directory
 from tests.conftest import SCENARIOS, with_slow
 from tests.figures.conftest import KINDS
 
@@ -162,6 +166,27 @@ def test_axes_have_units(drawing):
     for kind in ("ring", "ensemble", "slots"):
         for axes in drawing(kind).draw("error").axes:
             assert "units" in axes.get_ylabel() or "error |x - xhat|" in axes.get_ylabel()
+
+
+def test_axes_have_the_unit_of_the_states_and_values_that_differ(tmp_path):
+    """Of sweeps and of the law of P; large whole numbers keep their digits."""
+    scenario = netkf.load(SCENARIOS / "poisson_ring.toml", {"horizon": 1.0})
+    scenario = scenario.replace({"plant.units": ["m", "m"], "network.radio": {}})
+    bits = {"network.radio.bits_per_second": [20001, 20002], "filter.epsilon": [0.1, 0.3]}
+    plan = plan_sweep(scenario, bits, 1, engine="simpy")
+    sweep_to_directory(plan, tmp_path / "sweep", PoolOptions(1))
+    figure = netkf.open(tmp_path / "sweep").plot()
+    assert any(axes.get_ylabel() == "largest RMS error, m" for axes in figure.axes)
+    assert [label.get_text() for label in figure.axes[0].get_xticklabels()] == ["20001", "20002"]
+    law = netkf.simulate(scenario, engine="simpy").plot("law")
+    assert law.axes[0].get_xlabel() == "trace of P, squared m"
+
+
+def test_an_envelope_of_equal_values_has_an_axis():
+    row = {"replay": 0.0, "low": 0.0, "median": 0.0, "high": 0.0, "p": 1.0}
+    rows = [row | {"law": law, "quantity": "time connected"} for law in ("bernoulli", "per-link")]
+    figure = envelope_figure(pd.DataFrame(rows).assign(inside=True, runs=20))
+    assert np.ptp(figure.axes[0].get_xlim()) > 0.1
 
 
 def test_results_draw_themselves(results, sweeps):
