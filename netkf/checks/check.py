@@ -132,27 +132,27 @@ OF_PAPERS: dict[str, PaperChecks] = OF_EQUATIONS | {
     "track_fusion": track_fusion.CHECKS,
 }
 """The checks of each paper, by the name that filters give it (``Analysis.paper``)."""
+OF_EVENTS = {*OF_EQUATIONS, "stochastic_trigger"}
+"""Papers whose promises hold given the events of a run, whatever the plant and the nodes do."""
 
 
 def find_checks(scenario: Scenario) -> PaperChecks:
     """Return the checks of the paper of a scenario's filter; raises TheoryError without one."""
     if not scenario.is_linear:
         return WITHOUT_PAPER
+    promised = promised_filter(scenario.filter.algorithm)
+    paper, talks = promised.analysis.paper, promised.timing.talks
+    if talks and paper not in OF_PAPERS and not takes_columns(promised):
+        name = kind_name(promised)
+        raise TheoryError(f"nothing is promised of the {name} filter that could be checked")
     # Papers are about plants that do not change and are drawn, nodes that are up, and most about
     # nodes that estimate the whole state; the equations, and what they say of P, hold for all.
     changes = len(scenario.plant.changes) or not scenario.is_random or scenario.network.lives
-    promised = promised_filter(scenario.filter.algorithm)
     in_parts = scenario.views is not None and not have_one_view(scenario)
-    if (changes or in_parts) and promised.analysis.paper not in OF_EQUATIONS:
-        return UNDER_CLOCKS
     # Without messages the equations of a Kalman filter are all that is promised.
-    known = promised.analysis.paper in OF_PAPERS
-    if not promised.timing.talks or (takes_columns(promised) and not known):
+    if not talks or paper not in OF_PAPERS or ((changes or in_parts) and paper not in OF_EVENTS):
         return UNDER_CLOCKS
-    if not known:
-        name = kind_name(promised)
-        raise TheoryError(f"nothing is promised of the {name} filter that could be checked")
-    checks = OF_PAPERS[promised.analysis.paper]
+    checks = OF_PAPERS[paper]
     return UNDER_CLOCKS if checks.slots_only and not scenario.slotted else checks
 
 

@@ -118,9 +118,16 @@ def _mass_conserved(samples: RunSamples, level: float) -> Finding:
     return compare_identities(drift, np.ones_like(drift), terms, MASS_TOLERANCE, message)
 
 
-MASS_CONSERVED = Promise(
-    "mass is conserved", "P (67), derived", (MEMORY,), _mass_conserved, exact=True
-)
+def mass_conserved(scenario: Scenario, source: str = "P (67), derived") -> tuple[Promise, ...]:
+    """Return the promise of a ``source`` that exchanges conserve sums; none without such sums."""
+    filtering = with_promised_filter(scenario).node_filter
+    if filtering.analysis.conserved is nothing_conserved:
+        return ()
+    needs: tuple[str, ...] = (MEMORY,)
+    # Running sums conserve them whatever is lost.
+    if scenario.slotted and not getattr(filtering, "running_sums", False):
+        needs = (MEMORY, "both directions of a link", "nodes are up")
+    return (Promise("mass is conserved", source, needs, _mass_conserved, exact=True),)
 
 
 def summarise_drift(scenario: Scenario, run: Run) -> ReplicaSummary:
@@ -133,14 +140,10 @@ def summarise_drift(scenario: Scenario, run: Run) -> ReplicaSummary:
 
 def _promises_under_clocks(scenario: Scenario) -> tuple[Promise, ...]:
     analysis, design = with_promised_filter(scenario).node_filter.analysis, design_of(scenario)
-    conserved = analysis.conserved
-    # In slots mass is lost with messages, as P says, and who is down hears none.
-    dissipates = scenario.slotted and bool(scenario.network.lives)
-    mass = () if conserved is nothing_conserved or dissipates else (MASS_CONSERVED,)
     # P of other papers' filters may leave something out (kcf), or is proved of one fusion (ici).
     proved = design in ("larger", "equal") or analysis.paper in ("", "gossip", "intermittent")
-    bound = (UPPER_BOUND,) if proved and design != "smaller" else ()
-    return (*mass, FOLLOWS_EVENTS, *bound, *ERRORS, *left_out(scenario))
+    bound = (EXACT if design == "equal" else UPPER_BOUND,) if proved and design != "smaller" else ()
+    return (*mass_conserved(scenario), FOLLOWS_EVENTS, *bound, *ERRORS, *left_out(scenario))
 
 
 UNDER_CLOCKS = PaperChecks(_promises_under_clocks, summarise=summarise_drift)

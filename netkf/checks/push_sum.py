@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.checks.equations import MASS_CONSERVED, error_promises, summarise_drift
+from netkf.checks.equations import error_promises, mass_conserved, summarise_drift
 from netkf.checks.evidence import (
     COMPUTED,
     Assumption,
@@ -227,9 +226,6 @@ FOLLOWED = (
     "exact errors are within reach",
 )
 PROMISES = (
-    dataclasses.replace(
-        MASS_CONSERVED, source="P (67), (3)-(5) corrected", needs=("both directions of a link",)
-    ),
     Promise(
         "P follows steps 2 and 3 with the links that were up",
         "P (3)-(7)",
@@ -298,11 +294,7 @@ def _assumptions(scenario: Scenario) -> list[Assumption]:
 
 def _promises(scenario: Scenario) -> tuple[Promise, ...]:
     promised = with_promised_filter(scenario)
-    algorithm: Any = promised.filter.algorithm
-    promises: tuple[Promise, ...] = PROMISES
-    if algorithm.running_sums:
-        # Running sums conserve mass (the first promise) whatever is lost.
-        promises = (dataclasses.replace(PROMISES[0], needs=()), *PROMISES[1:])
+    promises = (*mass_conserved(scenario, "P (67), (3)-(5) corrected"), *PROMISES)
     if not searches_gamma(promised):
         return promises
     # These functions raise TheoryError where the limit or the gamma does not exist.
