@@ -30,7 +30,7 @@ from netkf.trace.messages import join_messages
 from netkf.trace.nees import traces
 from netkf.trace.run import Run
 
-SIMULATE = "get it from netkf.simulate, netkf.monte_carlo or netkf.open"
+SIMULATE = "get it from netkf.simulate, netkf.monte_carlo or netkf.open; a verdict has verdict.png"
 NO_TRUTH = "There is no ground truth in this run, so that its errors are unknown."
 
 
@@ -197,7 +197,8 @@ class FigureData:
 def reduce_result(result: Any) -> FigureData:
     """Return the data to draw of a run or an ensemble; raises ScenarioError."""
     if not isinstance(result, (Run, Ensemble)):
-        raise ScenarioError("", "plot takes a run, an ensemble or a sweep", result, SIMULATE)
+        rule = "plot takes a run, an ensemble, a sweep, compared filters or fitted laws of losses"
+        raise ScenarioError("", rule, type(result).__name__, SIMULATE)
     if result.scenario is None:
         raise ScenarioError("", "plot needs to know the scenario", result, SIMULATE)
     if isinstance(result, Run):

@@ -417,3 +417,69 @@ def test_two_readings_of_a_state_that_is_all_but_unknown(scenario_of, tmp_path, 
     (tmp_path / "both.csv").write_text("\n".join(rows) + "\n")
     run = netkf.simulate(scenario_of(text, "probability = 0.9", 5.0), engine=engine)
     assert run.log["t"][run.log["kind"] == CODES["refuse"]].tolist() == [2.0]
+
+
+ANCHORS = """
+format = 1
+name = "anchors"
+horizon = 4.0
+probe = 1.0
+[plant]
+kind = "unknown"
+{plant}
+mean = [3.0, 4.0]
+cov = [[1.0, 0.0], [0.0, 1.0]]
+[[sensors]]
+kind = "range"
+path = "y.csv"
+nodes = [0, 1]
+R = [[1.0]]
+positions = [[0.0, 0.0], [6.0, 0.0]]
+[network]
+graph = {{ kind = "path", nodes = 2 }}
+activation = {{ kind = "{activation}" }}
+[filter]
+kind = "local"
+"""
+TIMES = {
+    "slots": (
+        "F = [[0.9, 0.0], [0.0, 0.9]]\nQ = [[1.0, 0.0], [0.0, 1.0]]\nperiod = 1.0",
+        "broadcast",
+    ),
+    "clocks": ("A = [[-0.1, 0.0], [0.0, -0.1]]\nB = [[1.0, 0.0], [0.0, 1.0]]", "readings"),
+}
+
+
+@pytest.mark.parametrize("kind", ["local", "central"])
+@pytest.mark.parametrize("time", TIMES)
+def test_a_reading_at_sigma_points_is_judged_by_itself(tmp_path, time, kind):
+    """Healthy ones of the same instant are used as if the outliers were not in the table, and what
+    is inflated has the R with which its NIS is the limit.
+    """
+    plant, activation = TIMES[time]
+    (tmp_path / "s.toml").write_text(ANCHORS.format(plant=plant, activation=activation))
+    healthy = ["1.0,0,5.0,1", "1.0,1,5.0,1", "2.0,0,5,1", "3.0,0,5.0,1", "3.0,0,5.1,1"]
+    bad = {"1.0,0,60,1": 1, "2.0,1,40,1": 4}
+
+    def simulate(rows, gate=None):
+        (tmp_path / "y.csv").write_text("\n".join(["t,node,y0,R0", *rows]) + "\n")
+        changes = {"filter.kind": kind, "filter.linearise": "ckf"}
+        changes |= {} if gate is None else {"filter.gate": {"probability": 0.99, "then": gate}}
+        return netkf.simulate(netkf.load(tmp_path / "s.toml", changes))
+
+    rows = list(healthy)
+    for row, place in bad.items():
+        rows.insert(place, row)
+    gated, clean = simulate(rows, "ignore"), simulate(healthy)
+    assert gated.count("refuse") == len(bad)
+    np.testing.assert_allclose(gated.xhat, clean.xhat, rtol=1e-12)
+    np.testing.assert_allclose(gated.P, clean.P, rtol=1e-12)
+    # Before the first reading the state has this law, in both models of time.
+    mean, variance = simulate([]).xhat[1, 0], simulate([]).P[1, 0, 0, 0]
+    steps = np.sqrt(2.0 * variance) * np.vstack([np.eye(2), -np.eye(2)])
+    expected = np.hypot(*(mean + steps).T)
+    limit = scipy.stats.chi2.ppf(0.99, 1)
+    noise = float((60.0 - expected.mean()) ** 2 / limit - expected.var())
+    inflated, wider = simulate(["1.0,0,60,1"], "inflate"), simulate([f"1.0,0,60,{noise!r}"])
+    np.testing.assert_allclose(inflated.xhat, wider.xhat, rtol=1e-9)
+    np.testing.assert_allclose(inflated.P, wider.P, rtol=1e-9)

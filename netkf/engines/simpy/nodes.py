@@ -284,8 +284,9 @@ class Node:
         if not whole or reading is None or message.age > 0.0 or self.algorithm.needs.blocks:
             return payload
         # Whitened: the covariance of its noise is 1.
-        sample = reading.y, reading.H, np.eye(len(reading.y))
-        scale = self._gate_factor(sample, time, message.sender, recorder) ** -0.5
+        one = np.eye(len(reading.y))
+        sample = reading.y, reading.H, one
+        scale = self._gate_factor(sample, 0.0 * one, time, message.sender, recorder) ** -0.5
         return payload.with_reading(reading._replace(y=scale * reading.y, H=scale * reading.H))
 
     def _translated(self, envelope: Envelope, own: Any) -> Any:
@@ -318,8 +319,6 @@ class Node:
         is_linear = [isinstance(H, np.ndarray) for _, H, _ in samples]
         parts = [sample for sample, linear in zip(samples, is_linear, strict=True) if linear]
         parts.append((y, H, block_diagonal([R for *_, R in functions]) + extra))
-        if self._gate is not None:
-            return parts
         # Rows in the order of the sensors again: filters may use them one by one.
         first = np.repeat(is_linear, [len(R) for *_, R in samples])
         order = np.argsort(np.argsort(~first, kind="stable"))
@@ -328,35 +327,40 @@ class Node:
         return [(y, H, R[np.ix_(order, order)])]
 
     def gated(self, samples: Sequence[Sample], time: float, recorder: Recorder) -> Sequence[Sample]:
-        """Return the linearised samples of this ``time`` that the gate lets pass, with the R that
-        it gives them, and record those it refuses; entries of a sample that are nan do not count.
+        """Return the samples of this ``time`` that the gate lets pass, each by itself, with the R
+        that it gives them, and record those it refuses; entries that are nan do not count.
         """
         if self._gate is None:
             return samples
-        factors = [
-            self._gate_factor(sample, time, -1, recorder)
-            if self._timing.pooled or self.info.is_own(sample[1]).all()
-            else 1.0
-            for sample in samples
-        ]
         passed: list[Sample] = []
-        for (y, H, R), factor in zip(samples, factors, strict=True):
+        for y, H, R in samples:
+            ((value, J, C),) = self.linearise([(y, H, R)])
+            factor = 1.0
+            if self._timing.pooled or self.info.is_own(J).all():
+                factor = self._gate_factor((value, J, R), C - R, time, -1, recorder)
             if np.isfinite(factor):
                 passed.append((y, H, factor * R))
             elif self.algorithm.needs.every_reading:
                 # Its gains belong to rows, which stay: zeros tell nothing.
-                passed.append((0.0 * y, 0.0 * H, R))
+                passed.append((0.0 * value, 0.0 * J, R))
         return passed
 
-    def _gate_factor(self, sample: Sample, time: float, peer: int, recorder: Recorder) -> float:
-        """Return by what the gate multiplies R of a sample of ``peer`` (id, -1: its own)."""
+    def _gate_factor(
+        self, sample: Sample, extra: FloatArray, time: float, peer: int, recorder: Recorder
+    ) -> float:
+        """Return by what the gate multiplies R of a sample of ``peer`` (id, -1: its own); S is
+        H P H' + R + ``extra`` (p, p).
+        """
         xhat, P = self.estimate()
         y, H, R = sample
         present = np.isfinite(y) if len(y) == len(H) else np.zeros(len(H), dtype=bool)
         z, J, C = (y - H @ xhat)[present], H[present], R[np.ix_(present, present)]
         assert self._gate is not None
         assert P is not None
-        factor = self._gate.factor(z, J @ first_root(P), C)
+        spread = J @ first_root(P)
+        if extra.any():
+            spread = np.hstack([spread, first_root(extra)])
+        factor = self._gate.factor(z, spread, C)
         if factor != 1.0:
             recorder.append((time, REFUSE, self.node, peer, -1, -1, NAN))
         return factor
@@ -463,8 +467,7 @@ class ClockedNode(Node):
         for node in sensing:
             self._recorder.append((time, SENSE, node, -1, -1, -1, NAN))
         # One update with all samples: R is block diagonal, since sensors have independent noise.
-        taken = self.linearise([sample[1:] for sample in samples])
-        known = self.gated(taken, time, self._recorder)
+        known = self.linearise(self.gated([s[1:] for s in samples], time, self._recorder))
         nothing = np.empty(0), np.empty((0, self.width))
         y, H = (
             np.concatenate([nothing[part], *(sample[part] for sample in known)])

@@ -203,7 +203,7 @@ class SlotNode(Node):
         self._samples.append((y, H, R))
 
     def _update(self, time: float) -> None:
-        samples = self.gated(self.linearise(self._samples), time, self._recorder)
+        samples = self.linearise(self.gated(self._samples, time, self._recorder))
         # Empty arrays first, so that nodes without sensors concatenate too.
         y = np.concatenate([np.empty(0), *(y for y, *_ in samples)])
         H = np.concatenate([np.empty((0, self.width)), *(H for _, H, _ in samples)])
