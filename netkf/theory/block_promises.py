@@ -14,7 +14,7 @@ from netkf.rng.streams import Streams
 from netkf.runs.labels import covariance_bias
 from netkf.runs.tables import MAX_NODES, format_number, format_table
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import require_linear
+from netkf.theory.common.evidence import require_every_reading, require_linear
 from netkf.theory.common.observations import Observation, joseph_update, timed_observations
 from netkf.theory.hybrid.limits import central_covariance
 from netkf.theory.hybrid.samples import randomly_sampled_sensors
@@ -48,7 +48,8 @@ def block_promises(scenario: Scenario) -> dict[str, Any]:
 def _about_P(scenario: Scenario) -> str:
     if covariance_bias(scenario) == "larger":
         return "P is at least the covariance of the error, given the events, by design"
-    if not scenario.node_filter.timing.talks and scenario.is_linear:
+    keeps = scenario.is_linear and not scenario.forgetful_nodes
+    if keeps and not scenario.node_filter.timing.talks:
         return "P is the covariance of the error where the filters know plant, sensors and start"
     if takes_columns(scenario.node_filter) and scenario.node_filter.analysis.paper:
         return "P is the covariance of the error, given the events, where all assumptions hold"
@@ -60,6 +61,7 @@ def _about_P(scenario: Scenario) -> str:
 
 def central_at_horizon(scenario: Scenario) -> FloatArray:
     """Return the covariance (n, n) at the horizon of the central filter; else TheoryError."""
+    require_every_reading(scenario)
     if scenario.increment_sensors:
         raise TheoryError("samples beside increments: the least error covariance is not computed")
     for node, _ in randomly_sampled_sensors(scenario):

@@ -19,6 +19,7 @@ from netkf.linalg.spectra import contracts
 from netkf.scenario.registry import kind_name
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.delayed_jumps import DelayedJumps
+from netkf.theory.common.evidence import require_every_reading
 from netkf.theory.common.jumps import SlotJumps
 from netkf.theory.errors import diagonal_blocks, require_known_filter
 from netkf.theory.folders import LinearErrors, theory_of
@@ -131,6 +132,7 @@ def linear_errors(scenario: Scenario) -> LinearErrors:
 def _require_known_law(scenario: Scenario) -> None:
     """Raise TheoryError if the errors have no law: records, own equations, another model."""
     require_known_filter(scenario)
+    require_every_reading(scenario)
     if not scenario.is_random:
         raise TheoryError("the state or readings are recorded: their law is not known")
     believed, true = (

@@ -726,8 +726,9 @@ def test_no_theory_counts_readings_of_nodes_that_are_down(scenario_of, text, tmp
     summary = json.loads((netkf.save(run, scenario, tmp_path / "run") / "summary.json").read_text())
     assert summary["central"] is None
     assert [node["bound"] for node in summary["nodes"]] == 3 * [None]
-    with pytest.raises(netkf.TheoryError, match="down at times"):
-        netkf.theory.information_level(scenario)
+    for function in (netkf.theory.information_level, netkf.theory.steady_error_covariance):
+        with pytest.raises(netkf.TheoryError, match="down at times"):
+            function(scenario)
 
 
 def test_a_sweep_takes_wrong_clocks(scenario_of):

@@ -246,6 +246,16 @@ def test_no_filter_of_blocks_is_better_than_the_central_one(tmp_path: Path) -> N
     assert least["when"] == "at 2.25 s"
     seen = [one["value"][0][0] for one in least["blocks"]]
     np.testing.assert_allclose(seen, np.diag(P), rtol=1e-9)
+    # Nodes that are down do not read; one that forgets does not know the law of its state.
+    life = {"nodes": [2], "kind": "duty", "period": 1.0, "up": 0.4, "memory": "lost"}
+    sensor = {"of": "pose", "H": [[1.0]], "R": [[0.1]]}
+    sensor["sampling"] = {"kind": "periodic", "period": 0.5}
+    filtering = {"kind": "local", "estimates": "own"}
+    alone = clocked.replace({"filter": filtering, "sensors": [sensor]})
+    assert "P is the covariance" in compute_promises(alone)["P"]
+    asleep = compute_promises(alone.replace({"network.lives": [life]}))
+    assert "down at times" in asleep["least_error"]["reason"]
+    assert "nothing is promised" in asleep["P"]
 
 
 def test_blocks_that_all_estimate_are_a_plant_of_their_own(tmp_path: Path) -> None:
