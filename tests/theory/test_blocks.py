@@ -248,7 +248,7 @@ def test_no_filter_of_blocks_is_better_than_the_central_one(tmp_path: Path) -> N
     np.testing.assert_allclose(seen, np.diag(P), rtol=1e-9)
     # Nodes that are down do not read; one that forgets does not know the law of its state.
     life = {"nodes": [2], "kind": "duty", "period": 1.0, "up": 0.4, "memory": "lost"}
-    sensor = {"of": "pose", "H": [[1.0]], "R": [[0.1]]}
+    sensor = {"of": "pose", "nodes": [1, 2, 3], "H": [[1.0]], "R": [[0.1]]}
     sensor["sampling"] = {"kind": "periodic", "period": 0.5}
     filtering = {"kind": "local", "estimates": "own"}
     alone = clocked.replace({"filter": filtering, "sensors": [sensor]})
