@@ -141,8 +141,8 @@ def fit_log(
     progress: Progress | None = None,
 ) -> LogFit:
     """Fit laws of losses to the recorded outcomes of ``directory``, as ``netkf import`` leaves it,
-    and write ``fit_links.csv``, ``fit_tests.csv``, ``fit_laws.csv``, ``fit_envelope.csv`` and a
-    scenario of each law beside its scenario.toml.
+    or of a scenario file, and write ``fit_links.csv``, ``fit_tests.csv``, ``fit_laws.csv``,
+    ``fit_envelope.csv`` and a scenario of each law beside it.
 
     runs       : of each law, in which the replay is looked for; 0 for none, by default 200, or
                  fewer where these take long. Each draws the parameters of its law from their
@@ -151,9 +151,10 @@ def fit_log(
                  what is true
     Raises ScenarioError unless the scenario's loss is recorded.
     """
-    folder = as_path("directory", directory)
+    path = as_path("directory", directory)
+    path = path / "scenario.toml" if path.is_dir() else path
     confidence = float(number(above=0.0, below=1.0)("confidence", confidence))
-    scenario = load(folder / "scenario.toml", trust=trust)
+    scenario, folder = load(path, trust=trust), path.parent
     table, notes = read_outcomes(scenario)
     table, channels = _tell_channels(table, scenario.seed, notes)
     outcomes = make_outcomes(table)

@@ -417,6 +417,8 @@ def test_delays_of_one_length_are_constant_and_those_of_none_are_counted(tmp_pat
     found = netkf.fit_log(tmp_path / "made", runs=0)
     delay = netkf.load(found.scenarios["bernoulli"]).network.channel.delay
     assert delay.seconds == pytest.approx(0.3, abs=1e-12)
+    again = netkf.fit_log(tmp_path / "made" / "scenario.toml", runs=0)  # a file will do
+    assert again.scenarios == found.scenarios
     assert any("4 of 10 delays are 0" in note for note in found.notes) == (shares[1] > 0.0)
 
 
