@@ -26,7 +26,7 @@ from netkf.scenario.model import takes_samples
 from netkf.scenario.records import sensed_slots
 from netkf.scenario.registry import kind_name
 
-ANOTHER = 'use another filter, as kind = "diffusion"'
+ANOTHER = 'use another filter, such as kind = "diffusion"'
 
 
 def check_preconditions(scenario: DerivedScenario) -> None:
