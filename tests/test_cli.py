@@ -66,6 +66,12 @@ def test_theory_as_json_is_one_document(capsys):
     assert found["limit_covariance"]["trace"] == pytest.approx(2.194, rel=1e-3)
 
 
+@pytest.mark.parametrize("path", sorted(SCENARIOS.rglob("*.toml")), ids=lambda path: path.stem)
+def test_theory_of_every_scenario_is_a_json_document(path, capsys):
+    assert main(["theory", str(path), "--json", "--trust"]) in (0, 1)
+    assert json.loads(capsys.readouterr().out)["assumptions"]
+
+
 def test_settings_are_toml_or_bare_words():
     changes = parse_changes(["a.b=1.5", "c=[1, 2]", 'd="x y"', "e=word", "f=true", "g={ k = 1 }"])
     assert changes == {"a.b": 1.5, "c": [1, 2], "d": "x y", "e": "word", "f": True, "g": {"k": 1}}

@@ -236,7 +236,10 @@ def compute_innovations(run: Run, max_events: int = MAX_EVENTS) -> Innovations:
     """
     scenario: Scenario = run.scenario
     if len(run.log) > max_events:
-        raise NetkfError(f"a run of more than {max_events:,} events is not replayed")
+        raise NetkfError(
+            f"a run of more than {max_events:,} events is not replayed, and this one has "
+            f"{len(run.log):,}; use a shorter horizon"
+        )
     recorder = RecordingFilter(scenario.filter.algorithm, [], {})
     filtering = dataclasses.replace(scenario.filter, algorithm=recorder)
     replay = simulate(with_filter(scenario, filtering), run.seed, run.replica, "simpy")
