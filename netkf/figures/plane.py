@@ -13,6 +13,8 @@ from netkf.figures.names import SERIES
 from netkf.figures.network import MAX_LABELLED_NODES
 from netkf.figures.style import INK, MUTED, Picture, finish_figure, label_text, new_figure
 from netkf.linalg.arrays import FloatArray
+from netkf.plants.blocks import Block
+from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
 
 LEVEL = 0.95
@@ -60,17 +62,29 @@ def plane_figure(data: FigureData) -> Picture:
         _draw_path(axes, path, SERIES[k % len(SERIES)].colour, labels if k == 0 else [""] * 3)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.08)
-    axes.set(xlabel="first coordinate", ylabel="second coordinate")
+    xlabel, ylabel = (_axis_label(data.scenario, d) for d in (0, 1))
+    axes.set(xlabel=xlabel, ylabel=ylabel)
     axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
     finish_figure(figure, data.title(_headline(data, paths)), data.caption(_coverage(data, paths)))
     return figure
 
 
+def _placed_blocks(scenario: Scenario) -> list[Block]:
+    """Return the blocks that say where their nodes are in the plane."""
+    return [b for b in scenario.plants if b.position is not None and len(b.position) == 2]
+
+
+def _axis_label(scenario: Scenario, d: int) -> str:
+    """Return the name and unit of coordinate ``d``, where all blocks agree on them."""
+    labels = {block.plant.labels[block.position[d]] for block in _placed_blocks(scenario)}
+    label = label_text(labels.pop() if len(labels) == 1 else "", 40)
+    number = "second coordinate" if d else "first coordinate"
+    return f"{number} {label}".strip() if label[:1] in ("", "(") else label
+
+
 def _paths(run: Run) -> list[_Path]:
     scenario, paths = run.scenario, []
-    for block in scenario.plants:
-        if block.position is None or len(block.position) != 2:
-            continue
+    for block in _placed_blocks(scenario):
         place = np.ix_(range(len(run.times)), block.position, block.position)
         for node in block.nodes or ():
             own = scenario.estimated[scenario.topology.index[node]]

@@ -182,6 +182,22 @@ def test_axes_have_the_unit_of_the_states_and_values_that_differ(tmp_path):
     assert law.axes[0].get_xlabel() == "trace of P, squared m"
 
 
+def test_the_plane_has_the_names_and_units_of_its_coordinates():
+    file = SCENARIOS / "blocks" / "formation.toml"
+    for states, units, expected in (
+        (["east", "north"], ["m", "m"], ("east (m)", "north (m)")),
+        ([], ["m", "m"], ("first coordinate (m)", "second coordinate (m)")),
+        ([], [], ("first coordinate", "second coordinate")),
+    ):
+        named = {"states": states, "units": units}
+        changes = {
+            f"plants.{k}.{key}": value for k in (0, 1) for key, value in named.items() if value
+        }
+        run = netkf.simulate(netkf.load(file, changes | {"horizon": 3.0}), engine="simpy")
+        (axes,) = run.plot("plane").axes
+        assert (axes.get_xlabel(), axes.get_ylabel()) == expected
+
+
 def test_an_envelope_of_equal_values_has_an_axis():
     row = {"replay": 0.0, "low": 0.0, "median": 0.0, "high": 0.0, "p": 1.0}
     rows = [row | {"law": law, "quantity": "time connected"} for law in ("bernoulli", "per-link")]
