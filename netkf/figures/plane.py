@@ -69,14 +69,14 @@ def plane_figure(data: FigureData) -> Picture:
     return figure
 
 
-def _placed_blocks(scenario: Scenario) -> list[Block]:
-    """Return the blocks that say where their nodes are in the plane."""
-    return [b for b in scenario.plants if b.position is not None and len(b.position) == 2]
+def _placed_blocks(scenario: Scenario) -> list[tuple[Block, list[int]]]:
+    """Return the blocks that say where their nodes are in the plane, and the entries that do."""
+    return [(b, [*b.position]) for b in scenario.plants if b.position and len(b.position) == 2]
 
 
 def _axis_label(scenario: Scenario, d: int) -> str:
     """Return the name and unit of coordinate ``d``, where all blocks agree on them."""
-    labels = {block.plant.labels[block.position[d]] for block in _placed_blocks(scenario)}
+    labels = {block.plant.labels[entries[d]] for block, entries in _placed_blocks(scenario)}
     label = label_text(labels.pop() if len(labels) == 1 else "", 40)
     number = "second coordinate" if d else "first coordinate"
     return f"{number} {label}".strip() if label[:1] in ("", "(") else label
@@ -84,14 +84,13 @@ def _axis_label(scenario: Scenario, d: int) -> str:
 
 def _paths(run: Run) -> list[_Path]:
     scenario, paths = run.scenario, []
-    for block in _placed_blocks(scenario):
-        place = np.ix_(range(len(run.times)), block.position, block.position)
+    for block, chosen in _placed_blocks(scenario):
         for node in block.nodes or ():
             own = scenario.estimated[scenario.topology.index[node]]
             if any((one.name, one.node) == (block.name, node) for one in own):
-                pose, chosen = run.block(block.name, node), list(block.position)
+                pose = run.block(block.name, node)
                 xy = pose.x[:, chosen], pose.xhat[:, chosen]
-                paths.append(_Path(node, *xy, pose.P[place]))
+                paths.append(_Path(node, *xy, pose.P[:, chosen][:, :, chosen]))
     return paths
 
 

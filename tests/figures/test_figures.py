@@ -189,10 +189,8 @@ def test_the_plane_has_the_names_and_units_of_its_coordinates():
         ([], ["m", "m"], ("first coordinate (m)", "second coordinate (m)")),
         ([], [], ("first coordinate", "second coordinate")),
     ):
-        named = {"states": states, "units": units}
-        changes = {
-            f"plants.{k}.{key}": value for k in (0, 1) for key, value in named.items() if value
-        }
+        given = [("states", states), ("units", units)]
+        changes = {f"plants.{k}.{key}": x for k in range(5) for key, x in given if x}
         run = netkf.simulate(netkf.load(file, changes | {"horizon": 3.0}), engine="simpy")
         (axes,) = run.plot("plane").axes
         assert (axes.get_xlabel(), axes.get_ylabel()) == expected
