@@ -426,3 +426,9 @@ def test_equal_values_have_one_colour():
     assert len({value for dots in both for value in dots.get_array()}) == 1
     assert len({tuple(color) for dots in both for color in dots.get_facecolors()}) == 1
     assert not any(dots.get_clip_on() for dots in both)  # whole at the rim of their panel
+
+
+def test_nodes_of_a_matrix_that_have_labels_are_equally_far_apart():
+    scenario = netkf.load(SCENARIOS / "intel_lab.toml", {"horizon": 0.5})
+    axes = netkf.simulate(scenario).plot("matrix").axes[0]
+    assert len(set(np.diff(axes.get_xticks()))) == 1
