@@ -131,8 +131,6 @@ def to_json_value(value: Any) -> Any:
     """Return a value for JSON: Python numbers, lists, and None for floats that are not finite."""
     if isinstance(value, (float, np.floating)):
         return float(value) if math.isfinite(value) else None
-    if isinstance(value, np.ndarray):
-        value = value.tolist()
     if isinstance(value, dict):
         return {str(key): to_json_value(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
