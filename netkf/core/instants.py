@@ -30,6 +30,8 @@ from netkf.linalg.compiling import kernel
 
 MAX_TICKS = 1e15
 """Largest number of ticks up to the horizon, see above."""
+MAX_GIVEN_TICKS = 1.5 * MAX_TICKS
+"""The same of a resolution that is given: times are off by less than half a tick."""
 FINEST, COARSEST = -22, 0
 """Exponents of ten of the resolutions: float64 holds 10^22, and a tick is at most a second."""
 MAX_REFINE = 10_000

@@ -120,13 +120,22 @@ class FittedLaw(NamedTuple):
             return {"kind": "distance", "delivery": {"kind": "logistic", **table}}
         return {"kind": self.kind, **table}
 
+    def channel(self, loss: Any) -> dict[str, Any]:
+        """Return the keys of network.channel that the law sets: each direction has its own chain
+        of bursts, though others may share one fate.
+        """
+        alone = {"symmetric": False} if self.kind == "per-link-bursts" else {}
+        return {"loss": loss, **alone}
+
     def apply(self, scenario: Scenario, values: FloatArray, folder: Path) -> Scenario:
         """Return a scenario with the losses of the law, and its ``file`` in an empty ``folder``."""
-        changed: dict[str, Any] = {"network.channel.loss": self.loss_table(values)}
+        loss: Any = self.loss_table(values)
         if self.file:
             write_text(folder / self.file, self.text(values))
             make = ScheduledLoss if self.rows else GilbertElliott
-            changed = {"network.channel.loss": make(path=SourceFile(self.file, folder))}
+            loss = make(path=SourceFile(self.file, folder))
+        keys = self.channel(loss).items()
+        changed: dict[str, Any] = {f"network.channel.{key}": value for key, value in keys}
         if self.kind == "per-link":
             changed["network.graph"] = edges_with(
                 scenario, dict(zip(self.links, values, strict=True))

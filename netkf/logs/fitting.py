@@ -615,7 +615,7 @@ def _write(
         document = {**base, "name": f"{scenario.name}-{law.kind}"}
         document["claim"] = f"losses by the law {law.kind}, fitted to the log of {scenario.name}"
         network = {**base["network"]}
-        channel = {**network["channel"], "loss": law.loss_table(law.values)}
+        channel = network["channel"] | law.channel(law.loss_table(law.values))
         network["channel"] = channel | ({"delay": delay} if delay else {})
         if law.kind == "per-link":
             network["graph"] = {"kind": "csv", "path": FILES[0]}

@@ -17,6 +17,7 @@ from netkf.core.instants import (
     CLOSE,
     COARSEST,
     FINEST,
+    MAX_GIVEN_TICKS,
     MAX_REFINE,
     MAX_TICKS,
     TimeGrid,
@@ -176,10 +177,10 @@ def check_grid(scenario: Any) -> None:
     """Raise ScenarioError if the resolution fits no horizon or time, or a time is too short."""
     grid, given = scenario.time_grid, scenario.time.resolution
     least = _choose_automatically(scenario).resolution
-    if given is not None and given < least:
+    if given is not None and scenario.horizon * grid.per_second > MAX_GIVEN_TICKS:
         raise ScenarioError(
             "time.resolution",
-            f"must leave at most {MAX_TICKS:g} ticks to the horizon {scenario.horizon:.15g}",
+            f"must leave at most {MAX_GIVEN_TICKS:g} ticks to the horizon {scenario.horizon:.15g}",
             given,
             f"give at least {least:g}, or leave it out",
         )

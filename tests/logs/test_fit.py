@@ -356,8 +356,11 @@ def test_channels_of_packets_that_nobody_heard_are_not_invented(tmp_path):
     assert likelihood["hopping"] > likelihood["bernoulli"]
 
 
-def test_links_with_bursts_of_their_own(tmp_path):
-    """The table of chains holds what follows what in the record, and its runs are like the log."""
+@pytest.mark.parametrize("symmetric", ["false", "true"])
+def test_links_with_bursts_of_their_own(tmp_path, symmetric):
+    """The table of chains holds what follows what in the record, and its runs are like the log,
+    whatever a scenario that the log was imported like says of both directions.
+    """
     random, rows, bad = np.random.default_rng(5), ["t,src,dst,seq,heard"], {}
     for k in range(400):
         for i in range(3):
@@ -368,6 +371,10 @@ def test_links_with_bursts_of_their_own(tmp_path):
                 rows.append(f"{k + 0.2 * i + 1},{i},{j},{k},{int(not bad[i, j])}")
     (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
     netkf.import_log(tmp_path / "log.csv", "csv", tmp_path / "out")
+    scenario = tmp_path / "out" / "scenario.toml"
+    scenario.write_text(
+        scenario.read_text().replace("symmetric = false", f"symmetric = {symmetric}")
+    )
     fit = netkf.fit_log(tmp_path / "out", runs=6, workers=1)
     law = fit.laws.set_index("law").loc["per-link-bursts"]
     assert law["rejected_by"] == ""

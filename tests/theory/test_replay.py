@@ -7,6 +7,7 @@ import scipy.linalg
 import netkf
 from netkf import theory
 from netkf.scenario.reading import from_table
+from netkf.theory.common.arrivals import with_last_exchanges
 from netkf.theory.errors import error_law
 from tests.conftest import SCENARIOS
 from tests.engines.linearity import engine_covariance, engine_joint
@@ -211,3 +212,20 @@ def test_errors_that_overflow_are_infinite_without_a_warning(name, changes):
     run = netkf.simulate(scenario)
     assert run.status == "diverged"
     assert not np.isfinite(theory.error_covariance(scenario, run)).all()
+
+
+@pytest.mark.parametrize("horizon", [1.0, 9.75, 10.0, 100.0])
+def test_a_stored_run_of_any_horizon_has_exact_errors_at_its_end(tmp_path, horizon):
+    """The exchanges of the slot at the horizon are those of a run that is longer by a slot: one
+    with the same instants, also where a power of ten ends.
+    """
+    changes = {"horizon": horizon, "probe": 0.25, "filter": {"kind": "kcf"}}
+    changes["network.channel.delay"] = {"kind": "exponential", "mean": 0.02}
+    scenario = netkf.load(SCENARIOS / "push_sum_planar.toml", changes)
+    run = netkf.simulate(scenario)
+    stored = netkf.open(netkf.save(run, scenario, tmp_path / "run"))
+    longer = with_last_exchanges(stored.scenario, stored)
+    assert len(longer.log) > len(run.log)
+    assert longer.log[: len(run.log)].tobytes() == run.log.tobytes()
+    found = [netkf.theory.error_covariance(one.scenario, one) for one in (run, stored)]
+    np.testing.assert_array_equal(*found)

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Iterator
 
 from netkf.core.errors import EngineError, ScenarioError, TheoryError
+from netkf.core.instants import MAX_GIVEN_TICKS
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
@@ -42,8 +43,13 @@ def with_last_exchanges(scenario: Scenario, run: Run) -> Run:
     last = slots[-1] if slots else 0
     if algorithm.timing.predicts or not algorithm.timing.talks or not plant.over(last, horizon):
         return run
+    grid, end = scenario.time_grid, plant.slot_time(last + 1)
+    # The run is the same, to the bit, if its instants are; those of a very short one are not.
+    is_same = end * grid.per_second <= MAX_GIVEN_TICKS
+    resolution, refine = (grid.resolution, grid.refine) if is_same else (None, None)
+    changes = {"time.resolution": resolution, "time.refine": refine}
     try:
-        longer = scenario.replace({"horizon": plant.slot_time(last + 1), "probe": [horizon]})
+        longer = scenario.replace({"horizon": end, "probe": [horizon], **changes})
         repeated = simulate(longer, seed=run.seed, replica=run.replica)
     except (ScenarioError, EngineError) as error:
         raise TheoryError(
