@@ -226,14 +226,23 @@ def _rows_of(scenario: Scenario, placed: PlacedSensor) -> int:
 def _require_central(scenario: Scenario) -> None:
     plant, leave_out = scenario.plant, "leave it out"
     increments = "must take samples: increments have no density of their own"
+    linear = "must be linear, as the Kalman filter whose likelihood is fitted"
+    lives = "cannot be here: the likelihood is that of all readings, also of nodes that are down"
+    clocks = "cannot be here: the likelihood is that of readings with right stamps"
+    unknown = "must be true: an input that the model does not have would be fitted as noise"
     for wrong, key, rule, remedy in (
-        (not plant.linear, "plant", "must be linear", "simulate it linearised"),
-        (not scenario.has_linear_sensors, "sensors", "must be linear", "leave the others out"),
+        (not plant.linear, "plant", linear, "write a linear plant that is close to it"),
+        (not scenario.has_linear_sensors, "sensors", linear, "leave the others out"),
         (scenario.increment_sensors, "sensors", increments, "write sampling = { kind = ... }"),
-        (len(plant.changes), "plant.schedule", "would be a second model", "fit each by itself"),
-        (scenario.network.lives, "network.lives", "would leave out readings", leave_out),
-        (scenario.network.clocks, "network.clocks", "would date readings wrongly", leave_out),
-        (scenario.misses_input, "filter.model.input", "must be true: no noise", leave_out),
+        (
+            len(plant.changes),
+            "plant.schedule",
+            "cannot be here: the noise of one model is fitted",
+            "fit each part of the run by itself",
+        ),
+        (scenario.network.lives, "network.lives", lives, leave_out),
+        (scenario.network.clocks, "network.clocks", clocks, leave_out),
+        (scenario.misses_input, "filter.model.input", unknown, leave_out),
     ):
         if wrong:
             raise ScenarioError(key, rule, None, remedy)
