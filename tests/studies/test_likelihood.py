@@ -197,7 +197,7 @@ def test_blocks_of_one_name_share_a_variance(tmp_path):
         ({"filter.model": {"input": False}}, "filter.model.input"),
         (
             {"plant.input": None, "network.clocks": [{"nodes": [0], "offset": 0.1}]},
-            "network.clocks: would date",
+            "network.clocks: cannot be here",
         ),
     ],
 )
