@@ -291,8 +291,8 @@ FILES = {
     "reading": (stored, "_read_events", lambda real, *arguments: real(*arguments)[1:]),
     "transmissions": (
         transmissions.Transmissions,
-        "count_for",
-        lambda real, self, node: real(self, node) + 1,
+        "transmissions",
+        lambda real, self, nodes: [count + 1 for count in real(self, nodes)],
     ),
     "averages": (
         summary,
