@@ -556,14 +556,18 @@ class PushSum(Filter):
     tolerance: float = field(number(low=0.0), default=1e-6)
     running_sums: bool = field(boolean, default=False)
 
-    # Until others hear of its samples, a node counts them as if all nodes had taken them.
-    analysis = Analysis(
-        paper="push_sum",
-        P_by_design=("", "smaller"),
-        payload_numbers=push_sum_message_size,
-        conserved=mass_terms,
-        stopped=has_frozen,
-    )
+    @property
+    def analysis(self) -> Analysis:
+        """What the paper says of it, its mass and the size of its messages."""
+        return Analysis(
+            paper="push_sum",
+            # Until others hear of its samples, a node counts them as if all nodes had taken them.
+            P_by_design=("", "smaller"),
+            payload_numbers=push_sum_message_size,
+            conserved=mass_terms,
+            conserves_despite_loss=self.running_sums,
+            stopped=has_frozen,
+        )
 
     @property
     def kernels(self) -> Kernels:  # type: ignore[override]

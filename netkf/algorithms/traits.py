@@ -142,6 +142,7 @@ class Analysis:
                       filters report; by default that of an estimate with its covariance
     conserved : ``conserved(state)`` returns quantities by name, each a number or the terms of a
                 sum, whose sums over all nodes no exchange should change; a run reports their drift
+    conserves_despite_loss : nor do messages that are lost in slots, on one direction of a link only
     stopped : ``stopped(state)``, True once the node has permanently frozen its network estimate:
               what it computes of all nodes by exchanges, as number and information in push-sum
     wrapped : the filter that this one runs on its nodes, if it runs another, else None
@@ -156,6 +157,7 @@ class Analysis:
     P_by_design: tuple[str, str] = ("", "")
     payload_numbers: Callable[[int, int, int], float] = estimate_numbers
     conserved: Callable[[Any], Mapping[str, float | Sequence[float]]] = nothing_conserved
+    conserves_despite_loss: bool = False
     stopped: Callable[[Any], bool] = never
     wrapped: Any = None
     affine: bool = False

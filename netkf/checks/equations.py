@@ -120,12 +120,11 @@ def _mass_conserved(samples: RunSamples, level: float) -> Finding:
 
 def mass_conserved(scenario: Scenario, source: str = "P (67), derived") -> tuple[Promise, ...]:
     """Return the promise of a ``source`` that exchanges conserve sums; none without such sums."""
-    filtering = with_promised_filter(scenario).node_filter
-    if filtering.analysis.conserved is nothing_conserved:
+    analysis = with_promised_filter(scenario).node_filter.analysis
+    if analysis.conserved is nothing_conserved:
         return ()
     needs: tuple[str, ...] = (MEMORY,)
-    # Running sums conserve them whatever is lost.
-    if scenario.slotted and not getattr(filtering, "running_sums", False):
+    if scenario.slotted and not analysis.conserves_despite_loss:
         needs = (MEMORY, "both directions of a link", "nodes are up")
     return (Promise("mass is conserved", source, needs, _mass_conserved, exact=True),)
 
