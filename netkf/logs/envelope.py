@@ -28,6 +28,7 @@ from netkf.trace.run import Run
 
 COLUMNS = ["law", "quantity", "replay", "low", "median", "high", "p", "inside", "runs"]
 RUNS, FEW_RUNS, BUDGET = 200, 20, 180.0
+MIN_TO_GOOD = 1e-9  # a burst ends
 STREAM = 0x6C617773
 """Seeds the posterior draws apart from the streams of the runs."""
 
@@ -106,14 +107,18 @@ class FittedLaw(NamedTuple):
             lines = [f"{a!r},{b!r},{i},{j},{own[k]!r}" for a, b, (i, j), k in self.rows]
             return "\n".join(["from,until,sender,receiver,delivery", *lines, ""])
         both = zip(self.links, own, own[len(self.links) :], strict=False)
-        lines = [f"{i},{j},{bad!r},{max(good, 1e-9)!r}" for (i, j), bad, good in both]
+        lines = [f"{i},{j},{bad!r},{max(good, MIN_TO_GOOD)!r}" for (i, j), bad, good in both]
         return "\n".join(["sender,receiver,to_bad,to_good", *lines, ""])
 
     def loss_table(self, values: FloatArray) -> dict[str, Any]:
         """Return the table network.channel.loss with these ``values``, which may name ``file``."""
+        if self.rows:
+            return {"kind": "scheduled", "path": self.file}
         if self.file:
-            kind = "scheduled" if self.rows else "gilbert-elliott"
-            return {"kind": kind, "path": self.file}
+            # Directions without a packet in the log have the mean chain.
+            to_bad, to_good = (float(part.mean()) for part in np.split(values, 2))
+            chain = {"to_bad": to_bad, "to_good": max(to_good, MIN_TO_GOOD)}
+            return {"kind": "gilbert-elliott", "path": self.file, **chain}
         own = values.tolist()
         table = {} if self.kind == "per-link" else dict(zip(NAMES[self.kind], own, strict=True))
         if self.kind == "distance":
@@ -132,8 +137,8 @@ class FittedLaw(NamedTuple):
         loss: Any = self.loss_table(values)
         if self.file:
             write_text(folder / self.file, self.text(values))
-            make = ScheduledLoss if self.rows else GilbertElliott
-            loss = make(path=SourceFile(self.file, folder))
+            make = ScheduledLoss if loss.pop("kind") == "scheduled" else GilbertElliott
+            loss = make(**loss | {"path": SourceFile(self.file, folder)})
         keys = self.channel(loss).items()
         changed: dict[str, Any] = {f"network.channel.{key}": value for key, value in keys}
         if self.kind == "per-link":

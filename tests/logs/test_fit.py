@@ -389,6 +389,24 @@ def test_links_with_bursts_of_their_own(tmp_path, symmetric):
     assert loss.of((0, 1)).to_bad == table["to_bad"][0]
 
 
+def test_directions_without_a_packet_have_the_law_of_the_others(tmp_path):
+    """Node 1 never sends, though its link goes both ways."""
+    chain, rows, bad = np.random.default_rng(2), ["t,src,dst,seq,heard"], False
+    for k in range(300):
+        bad = chain.random() < (0.8 if bad else 0.1)
+        rows.append(f"{k + 1},0,1,{k},{int(not bad)}")
+    (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
+    netkf.import_log(tmp_path / "log.csv", "csv", tmp_path / "out")
+    scenario = tmp_path / "out" / "scenario.toml"
+    scenario.write_text(scenario.read_text().replace("directed = true", "directed = false"))
+    fit = netkf.fit_log(tmp_path / "out", runs=4, workers=1)
+    assert {"per-link-bursts", "gilbert-elliott"} <= set(fit.scenarios)
+    for path in fit.scenarios.values():
+        netkf.simulate(netkf.load(path))
+    loss = netkf.load(fit.scenarios["per-link-bursts"]).network.channel.loss
+    assert loss.of((1, 0)).transitions == pytest.approx(loss.of((0, 1)).transitions)
+
+
 def test_channels_and_stretches_are_kept_apart():
     rows = [
         {"sender": "a", "receiver": r, "message": k, "t": k, "transmission": k, "delivered": 1.0}
