@@ -558,7 +558,7 @@ class PushSum(Filter):
 
     @property
     def analysis(self) -> Analysis:
-        """What the paper says of it, its mass and the size of its messages."""
+        """Its paper, how P errs, its mass and the size of its messages."""
         return Analysis(
             paper="push_sum",
             # Until others hear of its samples, a node counts them as if all nodes had taken them.

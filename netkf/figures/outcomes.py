@@ -73,6 +73,11 @@ def fate_figure(data: FigureData) -> Picture:
     return figure
 
 
+def _ticks(count: int) -> np.ndarray:
+    """Return which of so many rows have a label: at most MAX_TICKS, equally far apart."""
+    return np.arange(0, count, -(-count // MAX_TICKS))
+
+
 def _draw_matrix(
     nodes: Sequence[int], values: FloatArray, span: tuple[float, float], colours: str, label: str
 ) -> tuple[Any, Picture]:
@@ -81,7 +86,7 @@ def _draw_matrix(
     axes = figure.add_subplot()
     cmap = mpl.colormaps[colours].with_extremes(bad="white")
     image = axes.imshow(values, vmin=span[0], vmax=span[1], cmap=cmap, interpolation="nearest")
-    places = np.arange(0, len(nodes), -(-len(nodes) // MAX_TICKS))
+    places = _ticks(len(nodes))
     names = [label_text(nodes[k]) for k in places.tolist()]
     is_tight = len(names) > MAX_NUMBERS or len(names) * max(map(len, names)) > MAX_LETTERS
     axes.set_xticks(places, names, fontsize=6.5, rotation=90 if is_tight else 0)
@@ -125,7 +130,7 @@ def losses_figure(data: FigureData) -> Picture:
     )
     pairs = (map(label_text, (data.nodes[k] for k in links[row])) for row in rows.tolist())
     names = [f"{sender} to {receiver}" for sender, receiver in pairs]
-    ticks = np.arange(0, len(rows), -(-len(rows) // MAX_TICKS))
+    ticks = _ticks(len(rows))
     lower.set_yticks(ticks + 0.5, [names[k] for k in ticks.tolist()], fontsize=5.5)
     lower.invert_yaxis()
     lower.set(xlabel=SECONDS, ylabel="sender to receiver")

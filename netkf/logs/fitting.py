@@ -173,10 +173,7 @@ def fit_log(
         notes.append("no bursts are to be seen: gilbert-elliott is not fitted")
     laws = _fit_laws(outcomes, links, distance, shrink, bursty)
     if tests["fate"].p < MAYBE and share.value > 0.0:
-        delivery, part = laws[0].values[0], min(share.value, 1.0)
-        likelihood, variance = stats.shared_law(outcomes, delivery, part)
-        cov = np.diag([variance * shrink, share.error**2])
-        laws.append(FittedLaw("shared", np.array([delivery, part]), likelihood, cov=cov))
+        laws.append(_shared_law(outcomes, laws[0].values[0], share, shrink))
     laws += _varying_laws(outcomes, edges, tests, shrink, scenario.horizon)
     needs = dict(NEEDS)
     if scenario.positions.moving:
@@ -493,6 +490,15 @@ def _fit_laws(
             laws.append(FittedLaw("distance", values, fit, cov=cov))
     pairs = tuple(links[["sender", "receiver"]].itertuples(index=False, name=None))
     return [law._replace(links=pairs) for law in laws]
+
+
+def _shared_law(
+    outcomes: LogOutcomes, delivery: float, share: stats.Share, shrink: float
+) -> FittedLaw:
+    part = min(share.value, 1.0)
+    likelihood, variance = stats.shared_law(outcomes, delivery, part)
+    cov = np.diag([variance * shrink, share.error**2])
+    return FittedLaw("shared", np.array([delivery, part]), likelihood, cov=cov)
 
 
 def _varying_laws(

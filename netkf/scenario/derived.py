@@ -4,6 +4,7 @@ states, message rates.
 
 from __future__ import annotations
 
+import bisect
 import dataclasses
 import itertools
 import math
@@ -207,6 +208,10 @@ class DerivedScenario(ScenarioModel):
         """The slots (C,) of the changes of the plant that filters follow."""
         period = self.slot_plant.period
         return tuple(round(t / period) for t in self.followed_changes.tolist())
+
+    def slot_belief_from(self, slot: int) -> tuple[FloatArray, FloatArray]:
+        """Return ``F`` and ``Q`` (n, n) by which filters predict from a ``slot`` to the next."""
+        return self.believed_pieces[bisect.bisect_right(self.followed_slots, slot)]
 
     @property
     def model_slots(self) -> tuple[int, ...]:

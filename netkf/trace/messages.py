@@ -79,7 +79,8 @@ def _keys(*pairs: tuple[np.ndarray, np.ndarray]) -> tuple[IntArray, IntArray]:
     total = np.zeros(len(columns[0]), dtype=np.int64)
     for column, size in zip(columns, sizes, strict=True):
         total = total * size + column
-    return total[: len(pairs[0][0])], total[len(pairs[0][0]) :]
+    first, second = np.split(total, [len(pairs[0][0])])
+    return first, second
 
 
 def by_link(messages: np.ndarray) -> Iterator[np.ndarray]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bisect
 import math
 
 import numpy as np
@@ -41,14 +40,13 @@ def bit_covariances(scenario: Scenario, run: Run) -> FloatArray:
     if scenario.topology.radius is not None:
         raise TheoryError("the log does not show the bits of a node with nobody in range")
     nodes, index, plant = scenario.nodes, scenario.topology.index, scenario.slot_plant
-    changes = plant.change_slots[: len(scenario.believed_pieces) - 1]
     sensors = [scenario.observation_matrices(node, believed=True) for node in nodes]
     used = _used_bits(scenario, run)
     P, covariances, slot = [np.asarray(scenario.initial_estimate(node)[1]) for node in nodes], [], 0
     for until in plant.slots_of(run.times).tolist():
         while slot < until:
+            F, Q = scenario.slot_belief_from(slot)
             slot += 1
-            F, Q = scenario.believed_pieces[bisect.bisect_left(changes, slot)]
             P = [lyapunov_step(one, F, Q) for one in P]
             for receiver, sender in used.get(slot, ()):
                 k = index[receiver]

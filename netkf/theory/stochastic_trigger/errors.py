@@ -8,7 +8,6 @@ reading: neither depends on what was read (Han et al. 2015, Theorem 2).
 
 from __future__ import annotations
 
-import bisect
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -123,9 +122,7 @@ def trigger_rate(P: ArrayLike, H: ArrayLike, R: ArrayLike, Y: ArrayLike) -> floa
 def expected_sends(scenario: Scenario, run: Run) -> tuple[int, float]:
     """Return the transmissions of a run and the sum of their probabilities, from slot 1 on."""
     algorithm: Any = scenario.filter.algorithm
-    sent = decisions(scenario, run)
-    pieces, Y = scenario.believed_pieces, algorithm.Y
-    changes = scenario.slot_plant.change_slots[: len(pieces) - 1]
+    sent, Y = decisions(scenario, run), algorithm.Y
     P = np.asarray(scenario.initial_estimate(scenario.nodes[0])[1])
     sensors = {
         k: Observation(H, R, np.asarray(np.linalg.cholesky(R)))
@@ -135,7 +132,7 @@ def expected_sends(scenario: Scenario, run: Run) -> tuple[int, float]:
     count, expected, slot = 0, 0.0, 1
     # All nodes hear everything, so that one P, given all decisions, is that of every node.
     while not scenario.slot_plant.over(slot, scenario.horizon):
-        P = lyapunov_step(P, *pieces[bisect.bisect_left(changes, slot)])
+        P = lyapunov_step(P, *scenario.slot_belief_from(slot - 1))
         if slot > 1:
             for k, (H, R, _) in sensors.items():
                 count += (slot, k) in sent
