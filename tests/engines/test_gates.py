@@ -225,6 +225,7 @@ def test_readings_of_others_pass_the_gate_too(scenario_of, tmp_path, then):
 FILTERS = {
     "slots": {
         "local": 'kind = "local"',
+        "central": 'kind = "central"',
         "hcmci": 'kind = "hcmci"',
         "diffusion": 'kind = "diffusion"',
         "constant-gain": 'kind = "constant-gain"\ngain = [{gain}, {wide}, {gain}]',
@@ -262,6 +263,14 @@ def test_both_engines_refuse_the_same_readings(scenario_of, time, name, then):
     text = network_of(time, name)
     run = assert_agree(scenario_of(text, f'probability = 0.95, then = "{then}"', 12.0))
     assert run.count("refuse") > 3
+
+
+@pytest.mark.parametrize("time", FILTERS)
+def test_refusals_of_a_filter_that_all_share_name_who_read(scenario_of, time):
+    run = assert_agree(scenario_of(network_of(time, "central"), "probability = 0.99", 12.0))
+    nodes = run.log["node"][run.log["kind"] == CODES["refuse"]]
+    assert np.bincount(nodes, minlength=3).argmax() == 1  # whose sensor is bad
+    assert len(nodes) > 3
 
 
 @pytest.mark.parametrize("time", FILTERS)

@@ -56,7 +56,7 @@ def gate_tables(
     gate: Gate,
     n: int,
     runs: tuple[int, int],
-    parts: Sequence[Sequence[tuple[int, int]]],
+    parts: Sequence[Sequence[Sequence[int]]],
     own: IntArray,
 ) -> GateTables:
     """Return the tables of a gate for estimates of n states, ``own`` (H,) of them of the own blocks

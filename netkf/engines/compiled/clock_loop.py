@@ -325,7 +325,7 @@ def pass_instant(
             instants.scale[s] = gate.scale[count, 0]
             if instants.scale[s] != 1.0:
                 refused = True
-                record_event(state, now, REFUSE, state.nodes[h].id, -1, -1)
+                record_event(state, now, REFUSE, instants.node[s], -1, -1)
             count += 1
     if refused:
         # Without the samples that are ignored.

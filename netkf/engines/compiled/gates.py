@@ -51,7 +51,7 @@ def with_refusals(
     """Return EVENT ``rows`` (K,) of the first run with those of its gates, behind the readings of
     their slots, and the number of rows before each sample, of ``before_sample`` (T,).
     """
-    setup, (slots, parts) = slot_setup(scenario), np.nonzero(refused[0, ..., 0])
+    setup, (slots, numbers) = slot_setup(scenario), np.nonzero(refused[0, ..., 0])
     if not len(slots):
         return rows, before_sample
     read = np.flatnonzero(rows["kind"] == SENSE)
@@ -64,9 +64,8 @@ def with_refusals(
     for name in ("peer", "message", "phase"):
         made[name] = -1
     made["t"], made["kind"], made["age"] = now[known], REFUSE, np.nan
-    nodes = np.full(1, -1) if setup.algorithm.timing.pooled else setup.nodes
-    counts = [len(parts) for parts in setup.gated_parts]
-    made["node"] = np.repeat(nodes, counts)[parts[known]]
+    nodes = np.array([node for parts in setup.gated_parts for *_, node in parts])
+    made["node"] = nodes[numbers[known]]
     places = read[last[known] - 1] + 1
     return insert_rows(rows, places, made, before_sample)
 

@@ -124,7 +124,7 @@ class SlotFilters:
                 setup.gate,
                 n,
                 (LANES, active),
-                setup.gated_parts,
+                [[place for *place, _ in parts] for parts in setup.gated_parts],
                 own_sizes(setup.infos, n, setup.algorithm.timing.pooled),
             )
         return cls(

@@ -186,12 +186,14 @@ class SlotSetup:
         self.regressor_sensors = [s for s, one in others if isinstance(one, RegressorSensor)]
 
     @cached_property
-    def gated_parts(self) -> list[list[tuple[int, int]]]:
-        """First row and number of rows of each reading of each filter: a table may have several."""
-        parts: list[list[tuple[int, int]]] = [[] for _ in range(self.estimators)]
+    def gated_parts(self) -> list[list[tuple[int, int, int]]]:
+        """First row and number of rows of each reading of each filter, and the node (id) that takes
+        it: a table may have several.
+        """
+        parts: list[list[tuple[int, int, int]]] = [[] for _ in range(self.estimators)]
         for s in self.assigned:
             p = len(s.R)
-            parts[s.estimator] += [(row, p) for row in range(s.row, s.row + s.rows, p)]
+            parts[s.estimator] += [(row, p, s.node) for row in range(s.row, s.row + s.rows, p)]
         return parts
 
     def _set_pairs(self, pairs: SlotPairs, scenario: Scenario) -> np.ndarray:

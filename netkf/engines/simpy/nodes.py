@@ -286,7 +286,9 @@ class Node:
         # Whitened: the covariance of its noise is 1.
         one = np.eye(len(reading.y))
         sample = reading.y, reading.H, one
-        scale = self._gate_factor(sample, 0.0 * one, time, message.sender, recorder) ** -0.5
+        scale = self._gate_factor(sample, 0.0 * one) ** -0.5
+        if scale != 1.0:
+            recorder.append((time, REFUSE, self.node, message.sender, -1, -1, NAN))
         return payload.with_reading(reading._replace(y=scale * reading.y, H=scale * reading.H))
 
     def _translated(self, envelope: Envelope, own: Any) -> Any:
@@ -326,18 +328,23 @@ class Node:
         R = block_diagonal([R for *_, R in parts])
         return [(y, H, R[np.ix_(order, order)])]
 
-    def gated(self, samples: Sequence[Sample], time: float, recorder: Recorder) -> Sequence[Sample]:
+    def gated(
+        self, samples: Sequence[tuple[int, *Sample]], time: float, recorder: Recorder
+    ) -> Sequence[Sample]:
         """Return the samples of this ``time`` that the gate lets pass, each by itself, with the R
-        that it gives them, and record those it refuses; entries that are nan do not count.
+        that it gives them, and record those it refuses with the node (id) before each, which took
+        it; entries that are nan do not count.
         """
         if self._gate is None:
-            return samples
+            return [(y, H, R) for _, y, H, R in samples]
         passed: list[Sample] = []
-        for y, H, R in samples:
+        for node, y, H, R in samples:
             ((value, J, C),) = self.linearise([(y, H, R)])
             factor = 1.0
             if self._timing.pooled or self.info.is_own(J).all():
-                factor = self._gate_factor((value, J, R), C - R, time, -1, recorder)
+                factor = self._gate_factor((value, J, R), C - R)
+                if factor != 1.0:
+                    recorder.append((time, REFUSE, node, -1, -1, -1, NAN))
             if np.isfinite(factor):
                 passed.append((y, H, factor * R))
             elif self.algorithm.needs.every_reading:
@@ -345,12 +352,8 @@ class Node:
                 passed.append((0.0 * value, 0.0 * J, R))
         return passed
 
-    def _gate_factor(
-        self, sample: Sample, extra: FloatArray, time: float, peer: int, recorder: Recorder
-    ) -> float:
-        """Return by what the gate multiplies R of a sample of ``peer`` (id, -1: its own); S is
-        H P H' + R + ``extra`` (p, p).
-        """
+    def _gate_factor(self, sample: Sample, extra: FloatArray) -> float:
+        """Return by what the gate multiplies R of a sample; S is H P H' + R + ``extra`` (p, p)."""
         xhat, P = self.estimate()
         y, H, R = sample
         present = np.isfinite(y) if len(y) == len(H) else np.zeros(len(H), dtype=bool)
@@ -360,10 +363,7 @@ class Node:
         spread = J @ first_root(P)
         if extra.any():
             spread = np.hstack([spread, first_root(extra)])
-        factor = self._gate.factor(z, spread, C)
-        if factor != 1.0:
-            recorder.append((time, REFUSE, self.node, peer, -1, -1, NAN))
-        return factor
+        return self._gate.factor(z, spread, C)
 
     def shift(self, offset: FloatArray) -> None:
         """Add ``offset`` (n,) to the estimate, after the origin of the coordinates has moved."""
@@ -455,7 +455,7 @@ class ClockedNode(Node):
                 if isinstance(part, PairReading):
                     self._pairs.append((node, part))
                 else:
-                    self._samples.append((node, part[0], part[1], part[2]))
+                    self._samples.append((node, *part))
             return
         self._samples.append((node, y, H, R))
 
@@ -467,7 +467,7 @@ class ClockedNode(Node):
         for node in sensing:
             self._recorder.append((time, SENSE, node, -1, -1, -1, NAN))
         # One update with all samples: R is block diagonal, since sensors have independent noise.
-        known = self.linearise(self.gated([s[1:] for s in samples], time, self._recorder))
+        known = self.linearise(self.gated(samples, time, self._recorder))
         nothing = np.empty(0), np.empty((0, self.width))
         y, H = (
             np.concatenate([nothing[part], *(sample[part] for sample in known)])

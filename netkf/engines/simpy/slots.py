@@ -150,7 +150,7 @@ class SlotNode(Node):
         self._stopped, self._has_stopped = False, self.algorithm.analysis.stopped
         # The slot that the estimate is of.
         self._slot = 0
-        self._samples: list[tuple[FloatArray, Any, FloatArray]] = []
+        self._samples: list[tuple[int, FloatArray, Any, FloatArray]] = []
         self._pairs: list[PairReading] = []
 
     def run_process(self, timeline: Timeline) -> Process:
@@ -187,9 +187,9 @@ class SlotNode(Node):
         if isinstance(self.moving_model, ChangingSlotModel):
             self.moving_model.move_to(slot if self._timing.predicts else slot - 1)
 
-    def read(self, y: FloatArray, H: Any, R: FloatArray) -> None:
-        """Store the reading y (p,) of one sensor with its H (p, n), or the function that linearises
-        it, and R (p, p), until the update of this slot.
+    def read(self, node: int, y: FloatArray, H: Any, R: FloatArray) -> None:
+        """Store the reading y (p,) of a sensor of ``node`` (id) with its H (p, n), or the function
+        that linearises it, and R (p, p), until the update of this slot.
         """
         if self.view is not None:
             if not len(y):
@@ -198,9 +198,9 @@ class SlotNode(Node):
                 if isinstance(part, PairReading):
                     self._pairs.append(part)
                 else:
-                    self._samples.append(part)
+                    self._samples.append((node, *part))
             return
-        self._samples.append((y, H, R))
+        self._samples.append((node, y, H, R))
 
     def _update(self, time: float) -> None:
         samples = self.linearise(self.gated(self._samples, time, self._recorder))
@@ -298,7 +298,7 @@ class Reader:
                     for sensor, R in sensors:
                         for reading in readings_of(sensor, slot, x, R):
                             if up:
-                                self._carrier.read(*reading)
+                                self._carrier.read(self._node, *reading)
             slot += 1
 
 
