@@ -13,7 +13,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -318,7 +318,7 @@ class NoiseFit(NotebookTable):
     log_likelihood : at the maximum; ``start_log_likelihood`` with the variances of the scenario
     readings       : number of scalar readings
     changes        : the fitted matrices by key of the scenario: filter.model.B or Q, and R
-    scenario       : the scenario with these
+    given          : the scenario without these
     """
 
     name: str
@@ -328,8 +328,15 @@ class NoiseFit(NotebookTable):
     readings: int
     confidence: float
     changes: dict[str, Any]
-    scenario: Scenario = field(repr=False)
+    given: Scenario = field(repr=False)
     notes: tuple[str, ...] = ()
+
+    @cached_property
+    def scenario(self) -> Scenario:
+        """The scenario with the changes; raises ScenarioError if its filter does not take them, of
+        which there is a note then.
+        """
+        return self.given.replace(self.changes)
 
     def __repr__(self) -> str:
         """Return one line: the variances and the gain of log-likelihood."""
@@ -497,7 +504,11 @@ def _make_fit(
         "as far as these readings tell, 0": zero,
         "these readings do not tell, by itself or apart from others": unknown,
     }
-    notes = tuple(f"{words}: {', '.join(names)}" for words, names in said.items() if names)
+    notes = [f"{words}: {', '.join(names)}" for words, names in said.items() if names]
+    try:
+        scenario.replace(changes)
+    except ScenarioError as error:
+        notes.append(f"the scenario cannot run with the values: {error}")
     return NoiseFit(
         scenario.name,
         table,
@@ -506,8 +517,8 @@ def _make_fit(
         len(model.y),
         confidence,
         changes,
-        scenario.replace(changes),
-        notes,
+        scenario,
+        tuple(notes),
     )
 
 
@@ -528,6 +539,7 @@ def _changes(
             noise += (factor - 1.0) * one.Q
         else:
             noise[:, one.columns] *= math.sqrt(factor)
+    noise += 0.0  # no -0.0
     changes = {f"filter.model.{'Q' if scenario.slotted else 'B'}": noise.tolist()}
     entries = sorted({one.entry for one in variances if one.Q is None})
     # Of recorded readings R is what filters believe anyway.

@@ -244,6 +244,24 @@ def test_a_sensor_without_noise_keeps_a_little(tmp_path):
     assert np.isfinite(netkf.simulate(found.scenario, engine="simpy").xhat).all()
 
 
+def test_values_that_the_filter_does_not_take_are_found_and_said(tmp_path):
+    """A noise of 0 leaves the inverse of P(0) = 0 to push-sum, as do readings of a still plant."""
+    plant = {"kind": "diffusion", "A": [[-0.3]], "B": [[1e-6]]}
+    sampling = {"kind": "periodic", "period": 0.5}
+    given = scenario(tmp_path, plant, {"H": [[1.0]], "R": [[1.0]], "sampling": sampling}, 30.0)
+    network = {"graph": {"kind": "edges", "edges": [[0, 1]]}}
+    network["activation"] = {"kind": "poisson", "rate": 1.0, "at": "nodes"}
+    summing = given.replace(
+        {"network": network, "filter": {"kind": "push-sum", "model": {"B": [[0.5]]}}}
+    )
+    fits = (fit_noise(summing, seed=seed) for seed in range(9))
+    found = next(fit for fit in fits if fit.table["value"][0] == 0.0)
+    assert found.changes["filter.model.B"] == [[0.0]]
+    assert "cannot run with the values: filter.cov: must be positive definite" in found.notes[-1]
+    with pytest.raises(netkf.ScenarioError, match="must be positive definite"):
+        _ = found.scenario
+
+
 @pytest.mark.parametrize(
     ("plant", "H", "unknown", "told"),
     [
