@@ -238,8 +238,9 @@ class BlockFiles(ABC):
 
     def paths(self) -> list[Path]:
         """Return the files of all blocks, in order."""
-        files = self._folder.glob("*.npz") if self._folder.is_dir() else ()
-        return sorted(files)
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            return sorted(file for file in self._folder.iterdir() if file.suffix == ".npz")
+        return []
 
     def check(self, file: Path, identity: dict[str, Any]) -> dict[str, Any]:
         """Return the stored identity of a block; raises DamagedError unless its file is intact."""

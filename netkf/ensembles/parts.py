@@ -84,7 +84,8 @@ def part_of_array(tasks: int, environment: Mapping[str, str] = os.environ) -> Pa
         count = read(names.count, regular)
         if count < 1 or count != regular or (first > 1 and first + step * (count - 1) <= tasks):
             return Part(index, tasks)
-        return Part((index - first) // step, count)
+        # Job 4 of 1 to 4 has the same part if it is submitted again, alone.
+        return Part((index - first) // step + first, count)
     return Part(0, 1)
 
 

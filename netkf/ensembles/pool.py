@@ -16,6 +16,8 @@ GROWTH = 16
 """Blocks become at most so many times larger at a time."""
 MAX_BLOCK = 1 << 16
 """Largest number of runs in a block."""
+LOOK_SECONDS = 1.0
+"""Interval at which futures, and a scheduler's connection, are looked at."""
 MIN_SECONDS = 0.05
 """CPU time of the last blocks, which become smaller so that all workers end at the same time."""
 
@@ -77,7 +79,10 @@ class Pool(ABC):
 
     def wait(self, futures: Collection[Future[BlockResult]]) -> Collection[Future[BlockResult]]:
         """Wait until one of the futures of ``submit`` is done; return all that are."""
-        return wait(futures, return_when=FIRST_COMPLETED).done
+        while not (done := [future for future in futures if future.done()]):
+            # An executor that is shut down cancels futures without a word to those who wait.
+            wait(futures, LOOK_SECONDS, FIRST_COMPLETED)
+        return done
 
     def close(self, at_once: bool) -> None:  # noqa: B027 - most have nothing of their own
         """Release the workers; ``at_once`` without waiting for unfinished blocks."""

@@ -16,7 +16,7 @@ from netkf.core.fields import integer
 from netkf.core.printable import shorten
 from netkf.ensembles.ask_scheduler import scheduler_answers
 from netkf.ensembles.blocks import BlockResult, Job, PackedScenario, pack_scenario, work
-from netkf.ensembles.pool import Pool, RemotePool
+from netkf.ensembles.pool import LOOK_SECONDS, Pool, RemotePool
 from netkf.ensembles.workers import ProcessPool
 from netkf.runs.provenance import versions
 from netkf.scenario.scenario import Scenario
@@ -33,8 +33,8 @@ in seconds above which worker processes are started, about the cost of starting 
 
 PATIENCE = 8
 """Seconds to wait for a scheduler."""
-LOOK_SECONDS, CLOSE_SECONDS = 1.0, 2.0
-"""Interval at which a scheduler's connection is checked, and longest wait when it is closed."""
+CLOSE_SECONDS = 2.0
+"""Longest wait when a scheduler's connection is closed."""
 MAX_ADDRESS = 1024  # characters; a longer address is refused
 
 
@@ -271,22 +271,22 @@ def make_pool(blocks: int, options: PoolOptions = ANYWHERE, open_ended: bool = F
     if len(names) > 1 and names != ["workers", "executor"]:
         rule = f"cannot go together with {names[1]}"
         raise ScenarioError(names[0], rule, values[names[0]], "give one of them")
+    count = None if workers is None else integer(low=1)("workers", workers)
     if executor is not None:
         client = getattr(executor, "scheduler", None)
         if client is not None and hasattr(executor, "scatter"):  # a Dask client has submit(), too
             address = getattr(client, "address", "tcp://HOST:PORT")
             remedy = f'give scheduler="{address}" in its place'
             raise ScenarioError("executor", "must not be a Dask client", executor, remedy)
-        if not hasattr(executor, "submit"):
+        if isinstance(executor, type) or not hasattr(executor, "submit"):
             remedy = "give a ThreadPoolExecutor, a ProcessPoolExecutor, or one like them"
             raise ScenarioError(
                 "executor", "must be a concurrent.futures.Executor", executor, remedy
             )
-        return ExecutorPool(executor, workers and integer(low=1)("workers", workers))
+        return ExecutorPool(executor, count)
     if scheduler is not None:
         return DaskPool(scheduler)
-    count = cores() if workers is None else integer(low=1)("workers", workers)
-    count = min(count, blocks)
+    count = min(count or cores(), blocks)
     if count == 1:
         return LocalPool()
     return AdaptivePool(count, open_ended) if workers is None else ProcessPool(count)

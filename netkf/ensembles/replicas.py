@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import operator
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import BrokenExecutor, Future
+from concurrent.futures import BrokenExecutor, CancelledError, Future
 from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -239,6 +239,8 @@ def _complete_blocks(pool: Pool, blocks: Iterator[Job]) -> Iterator[tuple[Job, B
         raise EngineError(
             f"{message} too small, or a class of the scenario ends the process"
         ) from error
+    except CancelledError:
+        raise EngineError("the executor was shut down before its runs were done") from None
     finally:
         for future in waiting:
             future.cancel()

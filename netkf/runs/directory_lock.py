@@ -30,7 +30,7 @@ def lock_directory(
         return
     # os.path instead of Path.exists, which raises for names that no file can have.
     is_new = not os.path.exists(directory)
-    make_directory(directory)
+    make_directory(directory, option=option)
     try:
         with _hold_lock(directory, option):
             if must_be_empty:

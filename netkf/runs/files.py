@@ -149,7 +149,7 @@ def create_output_directory(requested: Path | None, name: str, option: str = "--
         paths = (Path("runs") / f"{safe or 'run'}-{k}" for k in range(1, 1_000_000))
         # Creating it decides whether a name is free: another command may try it at the same time.
         return next(path for path in paths if make_directory(path, must_be_new=True))
-    make_directory(requested)
+    make_directory(requested, option=option)
     if any(requested.iterdir()):
         raise ScenarioError(
             option,
@@ -160,7 +160,7 @@ def create_output_directory(requested: Path | None, name: str, option: str = "--
     return requested
 
 
-def make_directory(path: Path, must_be_new: bool = False) -> bool:
+def make_directory(path: Path, must_be_new: bool = False, option: str = "--out") -> bool:
     """Create a directory unless it exists, and return True; False if it ``must_be_new`` and exists.
     Raises ScenarioError if it cannot be created or read.
     """
@@ -175,7 +175,7 @@ def make_directory(path: Path, must_be_new: bool = False) -> bool:
         reason = getattr(error, "strerror", None) or str(error)
     else:
         return True
-    raise ScenarioError("--out", f"cannot be made ({reason})", str(path), "choose another")
+    raise ScenarioError(option, f"cannot be made ({reason})", str(path), "choose another")
 
 
 def require_run(run: object) -> Scenario:

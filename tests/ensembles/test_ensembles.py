@@ -97,6 +97,19 @@ def test_an_executor_that_does_not_tell_its_workers_gets_as_many_blocks_as_it_ha
     assert counts.submitted == 2000
 
 
+def test_an_executor_that_is_shut_down_meanwhile_is_told_in_one_line(short):
+    class Ends(Executor):
+        """Is shut down by another thread: its futures are cancelled, and nobody hears of it."""
+
+        def submit(self, function, /, *arguments):
+            future = Future()
+            threading.Timer(0.05, future.cancel).start()
+            return future
+
+    with pytest.raises(netkf.EngineError, match="the executor was shut down before"):
+        netkf.monte_carlo(short, 12, executor=Ends())
+
+
 def test_moments_are_those_of_the_stored_runs(short):
     ensemble = netkf.monte_carlo(short, 7, workers=1)
     runs = [netkf.simulate(short, replica=k) for k in range(7)]
@@ -306,6 +319,8 @@ def test_a_users_class_travels_and_its_failure_is_one_line(tmp_path, workers):
             "workers: cannot go together with scheduler; got 2",
         ),
         ({"runs": 2, "executor": "mine"}, "executor: must be a concurrent.futures.Executor"),
+        ({"runs": 2, "executor": Executor}, "executor: must be a concurrent.futures.Executor"),
+        ({"runs": 2, "executor": Executor(), "workers": 0}, "workers: must be an integer of"),
     ],
 )
 def test_what_cannot_be_is_refused(short, arguments, words):

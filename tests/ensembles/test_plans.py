@@ -1,6 +1,7 @@
 """Plans: what workers leave in a directory, in any order and however they end, is one ensemble."""
 
 import datetime
+import errno
 import itertools
 import json
 import os
@@ -12,6 +13,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -133,17 +135,17 @@ def test_parts_cover_all_runs_once_from_0_or_from_1():
     ("variables", "part"),
     [
         ({}, Part(0, 1)),
-        ({"SLURM_ARRAY_TASK_ID": "12", "MIN": "10", "MAX": "13", "COUNT": "4"}, Part(2, 4)),
-        ({"SLURM_ARRAY_TASK_ID": "6", "MIN": "2", "MAX": "8", "STEP": "2"}, Part(2, 4)),
+        ({"SLURM_ARRAY_TASK_ID": "12", "MIN": "10", "MAX": "13", "COUNT": "4"}, Part(12, 4)),
+        ({"SLURM_ARRAY_TASK_ID": "6", "MIN": "2", "MAX": "8", "STEP": "2"}, Part(4, 4)),
         # Three jobs of the plan's five that are submitted again.
         ({"SLURM_ARRAY_TASK_ID": "4", "MIN": "1", "MAX": "4", "COUNT": "3"}, Part(4, 5)),
         ({"SLURM_ARRAY_TASK_ID": "4", "MIN": "3", "MAX": "4", "COUNT": "2"}, Part(4, 5)),
         ({"SLURM_ARRAY_TASK_ID": "2", "MIN": "2", "MAX": "2", "COUNT": "1"}, Part(2, 5)),
         ({"PBS_ARRAY_INDEX": "3"}, Part(3, 5)),
         ({"SGE_TASK_ID": "undefined"}, Part(0, 1)),
-        ({"SGE_TASK_ID": "3", "SGE_TASK_FIRST": "1", "SGE_TASK_LAST": "9"}, Part(2, 9)),
+        ({"SGE_TASK_ID": "3", "SGE_TASK_FIRST": "1", "SGE_TASK_LAST": "9"}, Part(3, 9)),
         ({"LSB_JOBINDEX": "0", "LSB_JOBINDEX_END": "9"}, Part(0, 1)),
-        ({"LSB_JOBINDEX": "9", "LSB_JOBINDEX_END": "9", "LSB_JOBINDEX_STEP": "1"}, Part(8, 9)),
+        ({"LSB_JOBINDEX": "9", "LSB_JOBINDEX_END": "9", "LSB_JOBINDEX_STEP": "1"}, Part(9, 9)),
     ],
 )
 def test_arrays_of_batch_systems_tell_the_part(variables, part):
@@ -151,6 +153,19 @@ def test_arrays_of_batch_systems_tell_the_part(variables, part):
     names = {name: f"SLURM_ARRAY_TASK_{name}" if name in short else name for name in variables}
     environment = {names[name]: value for name, value in variables.items()}
     assert part_of_array(5, environment) == part
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_a_job_that_is_submitted_again_alone_has_its_part_of_before(first):
+    def part_of(job, jobs):
+        array = {"ID": job, "MIN": jobs[0], "MAX": jobs[-1], "COUNT": len(jobs), "STEP": 1}
+        return part_of_array(
+            5, {f"SLURM_ARRAY_TASK_{name}": str(value) for name, value in array.items()}
+        )
+
+    jobs = range(first, first + 5)
+    for job in jobs[2:]:
+        assert part_of(job, [job]).of(RUNS) == part_of(job, jobs).of(RUNS)
 
 
 def test_time_and_interrupts_keep_what_was_finished(plan, whole, monkeypatch, capsys):
@@ -261,6 +276,18 @@ def test_what_is_no_plan_is_refused_in_one_line(plan, tmp_path, capsys):
     run = netkf.simulate(netkf.load(RING, {"horizon": 1.0}), engine="simpy")
     assert work(netkf.save(run, run.scenario, tmp_path / "single")) == 2
     assert "it is the directory of a single run" in capsys.readouterr().err
+
+
+def test_blocks_that_may_not_be_read_are_not_missing(plan, monkeypatch, capsys):
+    def refuse(folder):
+        raise PermissionError(errno.EACCES, "Permission denied", str(folder))
+
+    assert work(plan, "--part", "1/5") == 0
+    monkeypatch.setattr(Path, "iterdir", refuse)
+    capsys.readouterr()
+    for command in (work, merge):
+        assert command(plan) == 2
+        assert "Permission denied" in capsys.readouterr().err
 
 
 def test_a_full_disk_keeps_what_was_written(plan, whole, monkeypatch, capsys):

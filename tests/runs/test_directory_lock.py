@@ -62,8 +62,8 @@ def test_a_directory_is_made_and_removed_again_if_nothing_was_written(tmp_path):
     assert not (tmp_path / "a" / "b").exists()
     (tmp_path / "file").touch()
     with (
-        pytest.raises(netkf.ScenarioError, match="cannot be made"),
-        lock_directory(tmp_path / "file"),
+        pytest.raises(netkf.ScenarioError, match="--plan: cannot be made"),
+        lock_directory(tmp_path / "file", option="--plan"),
     ):
         pass
 
