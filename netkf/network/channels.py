@@ -65,14 +65,14 @@ class Channel(Component):
         """True if the outcomes of different activations are independent, with one law."""
         return self.loss.independent and self.channels is None
 
-    def mean_delivery(self, sent: Transmission) -> float:
+    def mean_delivery(self, sent: Transmission, horizon: float) -> float:
         """Return the fraction of messages that arrive in the long run on the link of ``sent``, its
-        message 0 at time 0; nan if it is unknown before a run.
+        message 0 at time 0, in a run of ``horizon`` seconds; nan if it is unknown before.
         """
         if sent.frames > 1 and (self.loss.stateful or self.channels is not None):
             return math.nan
         factor = 1.0 if self.channels is None else self.channels.mean(sent.link)
-        mean: float = (stated_delivery(self.loss, sent) * factor) ** sent.frames
+        mean: float = (stated_delivery(self.loss, sent, horizon) * factor) ** sent.frames
         return mean
 
     def deliveries(self, sent: Transmission) -> FloatArray:

@@ -146,17 +146,19 @@ class Loss(Component):
     def mean_delivery(self, sent: Transmission) -> float:
         """Return the fraction of messages that arrive in the long run on the link of ``sent``, its
         message 0 at time 0, for theory and summaries; nan if it is unknown before a run. By default
-        the delivery probability of that message in the good state, nan if the class draws
-        ``conditions``: override it if others differ.
+        the delivery probability of that message, nan if those of others differ, or the class draws
+        states or ``conditions``.
         """
-        if has_conditions(self):
+        if self.stateful or has_conditions(self):
             return math.nan
         return float(self.delivery_probability(sent))
 
     @property
     def independent(self) -> bool:
-        """True if the outcomes of different activations are independent."""
-        return True
+        """True if the outcomes of different activations are independent; by default if the class
+        draws no states and no ``conditions``.
+        """
+        return not (self.stateful or has_conditions(self))
 
     @property
     def chain(self) -> Chain | None:
@@ -486,6 +488,8 @@ class GilbertElliott(Loss):
         return Chain(*self.transitions, *delivery)
 
 
+MESSAGES_ASKED = 64
+"""Messages of a link for which a user's loss is asked if their probability is the same."""
 MESSAGE = ("sender", "receiver", "number", "bad", "table_probability", "distance")
 """What the kernel of a KernelLoss knows of a message, see Transmission, beside its time."""
 
@@ -584,9 +588,21 @@ def next_state(loss: Loss, link: Link, before: bool | None, random: np.random.Ge
     return bool(bad)
 
 
-def stated_delivery(loss: Loss, sent: Transmission) -> float:
-    """Return ``loss.mean_delivery``; raises ScenarioError unless it is a probability or nan."""
+def has_one_probability(loss: Loss, sent: Transmission, horizon: float) -> bool:
+    """Return True if all messages of a link up to the ``horizon`` (s) have one probability."""
+    times = np.linspace(0.0, horizon, MESSAGES_ASKED, endpoint=False)
+    many = sent._replace(number=np.arange(MESSAGES_ASKED), time=times)
+    return float(np.ptp(delivery_probabilities(loss, many))) == 0.0
+
+
+def stated_delivery(loss: Loss, sent: Transmission, horizon: float) -> float:
+    """Return ``loss.mean_delivery``, nan if a user's class leaves it to Loss and messages differ;
+    raises ScenarioError unless it is a probability or nan.
+    """
     mean: Any = loss.mean_delivery(sent)
+    is_left = type(loss).mean_delivery is Loss.mean_delivery and not identical_per_link(loss)
+    if is_left and not (math.isnan(mean) or has_one_probability(loss, sent, horizon)):
+        return math.nan
     if isinstance(mean, float) and math.isnan(mean):
         return math.nan
     name = f"{type(loss).__name__}.mean_delivery"

@@ -776,7 +776,7 @@ class ScenarioModel(Component):
         if self.topology.radius is not None or self.network_changes:
             return math.nan
         if link not in self._mean_deliveries:
-            mean = self.network.channel.mean_delivery(self.transmission(link))
+            mean = self.network.channel.mean_delivery(self.transmission(link), self.horizon)
             self._mean_deliveries[link] = mean
         return self._mean_deliveries[link]
 

@@ -292,7 +292,8 @@ def _check_fractions(watched: WatchedPart, links: dict[Link, float], seed: int) 
         of_known = law._replace(lost=law.lost[known], links=list(compress(links, known)))
         shares = compare_losses(of_known, counts, family_level())
         rule = "must be the delivered fraction in the long run"
-        demand_agreement(shares, f"{watched.name}.mean_delivery", rule)
+        remedy = "define it; nan if it is unknown"
+        demand_agreement(shares, f"{watched.name}.mean_delivery", rule, remedy)
     if part.independent:
         rule = "must be False where outcomes of neighbouring activations or links are related"
         labels = [str(list(link)) for link in links]

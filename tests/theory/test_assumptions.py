@@ -1,11 +1,12 @@
 """Rows of assumptions under clocks, and "not known" for what a record does not show."""
 
 import dataclasses
+import math
 
 import pytest
 
 import netkf
-from netkf import theory
+from netkf import parts, theory
 from netkf.network import channels
 from tests.conftest import SCENARIOS
 
@@ -78,3 +79,70 @@ def test_only_the_channel_without_losses_makes_every_exchange_a_swap():
     channel = channels.Channel(loss=NoLoss(), symmetric=False)
     network = dataclasses.replace(scenario.network, channel=channel)
     assert not holds(dataclasses.replace(scenario, network=network))["every exchange is a swap"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Fades(parts.Loss):
+    """Says nothing of the mean: message 0 is no measure for those that follow."""
+
+    def delivery_probability(self, sent):
+        return 1.0 if sent.time < 1.0 else 0.2
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Unsaid(parts.Loss):
+    """Says that the mean is unknown, of the links of node 0 or of all."""
+
+    of_node_0: bool = parts.setting(parts.boolean, default=False)
+
+    def delivery_probability(self, sent):
+        return 0.7
+
+    def mean_delivery(self, sent):
+        return math.nan if not self.of_node_0 or 0 in sent.link else 0.7
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Moody(parts.Loss):
+    """Has states, and says nothing of their law."""
+
+    stateful = True
+
+    def next_state(self, link, bad, random):
+        return random.random() < 0.3
+
+    def delivery_probability(self, sent):
+        return 0.1 if sent.bad else 1.0
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Weather(parts.Loss):
+    """Has one delivery for all messages of a run, and says nothing of its law."""
+
+    def conditions(self, random, horizon):
+        return random.random()
+
+    def delivery_probability(self, sent):
+        return sent.conditions
+
+
+@pytest.mark.parametrize(
+    "loss", [Fades(), Unsaid(), Unsaid(of_node_0=True), Moody(), Weather()], ids=repr
+)
+def test_what_a_loss_does_not_say_theory_does_not_know(loss):
+    """It took message 0 for all, and nan for a link that carries nothing."""
+    for name in ("poisson_ring", "intermittent_scalar", "diffusion_regression", "push_sum_planar"):
+        scenario = netkf.load(SCENARIOS / f"{name}.toml").replace({"network.channel.loss": loss})
+        table = theory.assumptions(scenario)
+        arrives = table.assumption.str.contains("arriv|arrive|p_d|fail anew|unbiased|mean square$")
+        assert arrives.any()
+        allowed = (False, None) if not loss.independent else (None,)
+        certified = table.assumption.str.contains("certified|averaging")
+        assert all(held in allowed for held in table.holds[arrives & ~certified]), table
+        if name == "poisson_ring":
+            with pytest.raises(netkf.TheoryError, match="arrive is not known beforehand"):
+                theory.covariance_bound(scenario, [1.0])
+            verdict = netkf.check(scenario.replace({"horizon": 4.0}), runs=10, workers=1)
+            rows = verdict.table.set_index("promise").verdict
+            assert bool(verdict)
+            assert rows[rows.index.str.contains("lost as often|Riccati")].eq("not promised").all()

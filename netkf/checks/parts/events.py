@@ -152,13 +152,17 @@ def loss_law(scenario: Scenario) -> LossLaw:
     channel, clock = scenario.network.channel, scenario.network.activation
     loss, links = stated_part(channel.loss, "loss"), scenario.topology.directions
     stated = dataclasses.replace(channel, loss=loss)
-    delivery = [stated.mean_delivery(scenario.transmission(link)) for link in links]
+    delivery = [
+        stated.mean_delivery(scenario.transmission(link), scenario.horizon) for link in links
+    ]
     at_once = getattr(clock, "at", "links") == "links"
     senders, receivers = np.array(links, dtype=np.int64).reshape(-1, 2).T
     opposite = _entity_indices(links, [receivers, senders])
     hops = None
     if channel.channels is not None:
-        alone = [stated_delivery(loss, scenario.transmission(link)) for link in links]
+        alone = [
+            stated_delivery(loss, scenario.transmission(link), scenario.horizon) for link in links
+        ]
         on_hops = [channel.channels.on_hops(link) for link in links]
         hops = 1.0 - np.array(alone)[:, None] * np.array(on_hops)
     # Broadcasts of two nodes at different times would both step a chain that they share.

@@ -5,6 +5,8 @@ A record is one outcome and does not show the law that it came from: the verdict
 
 from __future__ import annotations
 
+import math
+
 from netkf.core.errors import TheoryError
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.runs.labels import forgetting
@@ -78,17 +80,26 @@ def require_every_reading(scenario: Scenario) -> None:
 
 def no_channel_law(scenario: Scenario) -> str:
     """Return why it is not known how often messages arrive, where :func:`lacks_channel_law`."""
-    reason = "losses or delays are recorded, or nodes move"
     if scenario.network_changes and not scenario.links_move:
         reason = "nodes are down at times, or messages wait for each other"
+    elif scenario.network_changes or _is_recorded(scenario):
+        reason = "losses or delays are recorded, or nodes move"
+    else:
+        return "how often messages arrive is not known beforehand"
     return f"{reason}: what arrives has no known law"
 
 
 def lacks_channel_law(scenario: Scenario) -> bool:
-    """Return True if losses or delays are read from a table, or nodes move or are down."""
+    """Return True if losses or delays are read from a table, nodes move or are down, or the loss
+    does not say how often messages arrive.
+    """
+    unstated = (math.isnan(scenario.mean_delivery(link)) for link in scenario.topology.directions)
+    return _is_recorded(scenario) or scenario.network_changes or any(unstated)
+
+
+def _is_recorded(scenario: Scenario) -> bool:
     channel = scenario.network.channel
-    recorded = isinstance(channel.loss, RecordedLoss) or isinstance(channel.delay, RecordedDelay)
-    return recorded or scenario.network_changes
+    return isinstance(channel.loss, RecordedLoss) or isinstance(channel.delay, RecordedDelay)
 
 
 def true_model_row(scenario: Scenario, source: str, matrices: str) -> AssumptionRow:

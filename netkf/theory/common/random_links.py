@@ -19,8 +19,8 @@ from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.network.clocks import LinkClock
 from netkf.network.losses import (
     GilbertElliott,
-    delivery_probabilities,
     has_conditions,
+    has_one_probability,
     identical_per_link,
 )
 from netkf.network.matchings import RecordedSlots
@@ -29,8 +29,6 @@ from netkf.theory.common.evidence import lacks_channel_law, no_channel_law
 
 MAX_CHAINS = 10
 """Independent chains of bursty links whose joint states are enumerated."""
-MESSAGES_ASKED = 64
-"""First messages of a link for which a user's loss is asked if their probability is the same."""
 
 
 class Directions(NamedTuple):
@@ -238,13 +236,10 @@ def has_constant_losses(scenario: Scenario) -> bool:
         return scenario.network.channel.channels is None
     if has_conditions(loss) or scenario.network.channel.channels is not None:
         return False
-    times = np.linspace(0.0, scenario.horizon, MESSAGES_ASKED, endpoint=False)
-    for direction in scenario.topology.directions:
-        one = scenario.transmission(direction)
-        sent = one._replace(number=np.arange(MESSAGES_ASKED), time=times)
-        if np.ptp(delivery_probabilities(loss, sent)) > 0.0:
-            return False
-    return True
+    return all(
+        has_one_probability(loss, scenario.transmission(direction), scenario.horizon)
+        for direction in scenario.topology.directions
+    )
 
 
 def _deliveries(

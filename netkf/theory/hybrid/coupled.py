@@ -24,7 +24,12 @@ from netkf.network.spectra import connected_parts
 from netkf.plants.transitions import Transitions
 from netkf.scenario.registry import kind_name
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import life_rows, no_channel_law, nonlinear_rows
+from netkf.theory.common.evidence import (
+    lacks_channel_law,
+    life_rows,
+    no_channel_law,
+    nonlinear_rows,
+)
 from netkf.theory.common.observations import increment_observations
 from netkf.theory.hybrid import dense
 from netkf.theory.hybrid.dense import FullMatrix, SparseOrFull, full_matrix, solve_or_nan
@@ -123,9 +128,9 @@ def reason_without_bound(scenario: Scenario) -> str | None:
     if network.channel.delay.fixed is None:
         return "not promised: Tanwani's H(12) holds for no or fixed delays, and the delay is random"
     dependent = "not promised: losses depend on earlier ones, so arrivals are not Poisson processes"
-    if scenario.network_changes:
+    if lacks_channel_law(scenario):
         dependent = f"not promised: {no_channel_law(scenario)}"
-    independent = network.channel.independent and not scenario.network_changes
+    independent = network.channel.independent and not lacks_channel_law(scenario)
     return _reason_of_samples(scenario) if independent else dependent
 
 

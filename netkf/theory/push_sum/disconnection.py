@@ -22,6 +22,7 @@ from netkf.core.errors import TheoryError
 from netkf.network.graphs import Topology
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
+from netkf.theory.common.evidence import no_channel_law
 from netkf.theory.numerics.matrices import as_integer
 
 if TYPE_CHECKING:
@@ -194,7 +195,7 @@ def _channel_probabilities(scenario: Scenario) -> dict[Edge, float]:
     for i, j in scenario.topology.links:
         forward, backward = (scenario.mean_delivery(direction) for direction in ((i, j), (j, i)))
         if math.isnan(forward + backward):
-            raise TheoryError("the channel is a record, not a law: give delivery")
+            raise TheoryError(f"{no_channel_law(scenario)}: give delivery")
         if forward != backward or (not channel.symmetric and 0.0 < forward < 1.0):
             raise TheoryError("the two directions of a link fail apart: give delivery")
         probabilities[i, j] = forward
