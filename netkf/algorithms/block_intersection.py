@@ -332,7 +332,8 @@ def block_record(
 def begin_block(filtering: BlockIntersection, node: Any, info: NodeInfo, _model: Any) -> None:
     """Set what may depend on others at time 0: errors are independent, but for rule "ci"."""
     P = node["root"] @ node["root"].T
-    is_own = filtering.rule == "split" and info.alone
+    # The error of a node that begins again is in those of all whom it has told before.
+    is_own = filtering.rule == "split" and info.alone and not info.forgets
     node["dependent"][:] = 0.0 if is_own or filtering.rule == "naive" else P
 
 

@@ -96,6 +96,7 @@ class NodeInfo(NamedTuple):
     whole : all blocks at their places in the whole state, if ``Needs.coupled`` says so
     alone : no other node estimates one of these
     heard : the blocks of each of ``senders``, at their places in its own state
+    forgets : it may go down and begin again with what it knew at time 0 (network.lives)
     sampled : H (p, n) and R (p, p) of its sensors that take samples (in slots: of all) together, as
               the node believes them, where they are fixed; p = 0 without such sensors
     """
@@ -116,6 +117,7 @@ class NodeInfo(NamedTuple):
     alone: bool = True
     whole: tuple[Any, ...] = ()
     heard: tuple[tuple[Any, ...], ...] = ()
+    forgets: bool = False
 
     def own_states(self, n: int) -> int:
         """Return how many of its n states are of its own blocks, which come first."""

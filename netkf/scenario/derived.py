@@ -372,7 +372,7 @@ class DerivedScenario(ScenarioModel):
                 most_rows,
                 self._own_sensors(k, sampled.get(node, ())), places[node],
                 self._is_alone(k, counts), whole,
-                tuple(places[i] for i in senders(node)),
+                tuple(places[i] for i in senders(node)), node in self.forgetful_nodes,
             )
             for k, node in enumerate(self.nodes)
         )  # fmt: skip

@@ -230,6 +230,20 @@ def test_only_the_naive_update_is_overconfident(tmp_path: Path, estimates: str) 
         assert too_small == (settings.get("rule") == "naive"), (settings, ensemble)
 
 
+def test_a_node_that_forgets_does_not_take_its_past_for_news(tmp_path: Path) -> None:
+    # At rest, so that mean and cov are the law of x when a node begins again.
+    lives = "".join(f"{k}.2,1,down\n{k}.4,1,up\n" for k in range(2, 10))
+    (tmp_path / "lives.csv").write_text("t,node,what\n" + lives)
+    life = {"kind": "recorded", "nodes": [1], "path": "lives.csv", "memory": "lost"}
+    text = ROBOTS.replace("[[0.9]]", "[[0.995]]").replace("[[0.2]]", f"[[{1.0 - 0.995**2}]]")
+    text = text.replace("[[0.1]]", "[[3.0]]").replace("[[0.3]]", "[[0.01]]")
+    scenario = load(text, tmp_path, network__lives=[life])
+    runs = 60
+    ensemble = netkf.monte_carlo(scenario, runs, workers=1)
+    # Each at 1e-6; the squared errors of nodes that are told old news as new ones are four times P.
+    assert (ensemble.mean_nees < chi2.ppf(1.0 - 1e-6, runs) / runs).all()
+
+
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("text", [ROBOTS, CLOCKED], ids=["slots", "clocks"])
 def test_all_that_a_message_tells_is_used_at_once(tmp_path: Path, text: str, rule: str) -> None:
