@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from netkf.core.fields import Component, field, integer, number, one_of, positive
 from netkf.linalg.arrays import FloatArray
+from netkf.network.lives import lifetimes
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,12 +57,20 @@ class Energy(Component):
 
 
 class Airtime:
-    """When the radios of nodes send, in one run."""
+    """When the radios of nodes send, in one run. What a node is sending, or has waiting, when it
+    goes down is lost.
+    """
 
-    def __init__(self, radio: Radio) -> None:
-        self.radio = radio
+    def __init__(self, scenario: Any, streams: Any) -> None:
+        self.radio: Radio = scenario.network.radio
+        self._instant = scenario.time_grid.instant
+        # When nodes that have lives go down.
+        self._down = {
+            node: [*(change.time for change in life.changes if not change.up), math.inf]
+            for node, life in lifetimes(scenario, streams).items()
+        }
         self._free: dict[int, float] = {}
-        # The end of the present transmission of each node, nan if it is dropped.
+        # The end of the present transmission of each node, nan if it is lost.
         self._end: dict[int, float] = {}
 
     def begin(self, sender: int) -> None:
@@ -67,18 +78,22 @@ class Airtime:
         self._end.pop(sender, None)
 
     def end(self, sender: int, size: float, now: float) -> float:
-        """Return when the last bit of ``size`` bytes of ``sender`` is sent; nan if dropped."""
+        """Return when the last bit of ``size`` bytes of ``sender`` is sent; nan if it never is."""
         if sender not in self._end:
             free = self._free.get(sender, 0.0)
             if free > now and self.radio.queue == "drop":
                 self._end[sender] = math.nan
             else:
-                self._end[sender] = self._free[sender] = max(now, free) + self.radio.seconds(size)
+                end = self._instant(max(now, free) + self.radio.seconds(size))
+                falls = self._down.get(sender, [math.inf])
+                down = falls[bisect_right(falls, now)]
+                self._free[sender] = min(end, down)
+                self._end[sender] = math.nan if end > down else end
         return self._end[sender]
 
     def waits(self, sender: int, sizes: Iterable[float], times: FloatArray) -> FloatArray:
         """Return the seconds until the last bits of K transmissions of ``sender`` are sent, one
-        after the other at ``times`` (K,) of so many bytes; nan if dropped.
+        after the other at ``times`` (K,) of so many bytes; nan if they never are.
         """
         ends = []
         for size, now in zip(sizes, times.tolist(), strict=True):

@@ -153,3 +153,42 @@ def test_both_engines_wait_alike(scenario_of, at, radio):
     arrived = run.log[run.log["kind"] == CODES["deliver"]]
     assert arrived["age"].min() >= AIR - 1e-9
     assert_alone(scenario, CompiledEngine(), 5, range(2), fingerprint=True)
+
+
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_a_radio_is_free_at_the_instant_at_which_a_message_ends(scenario_of, engine):
+    clock = {"kind": "periodic", "period": 0.1, "at": "nodes"}
+    scenario = scenario_of('bits_per_second = 1280.0, queue = "drop"', 40.0)
+    run = netkf.simulate(scenario.replace({"network.activation": clock}), engine=engine)
+    assert run.count("send") == 6 * 399
+    assert not run.count("lost")
+
+
+@pytest.mark.parametrize("queue", ["wait", "drop"])
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_a_node_that_goes_down_sends_nothing_any_more(scenario_of, engine, queue):
+    lives = {"nodes": [0, 2], "kind": "crashes", "mean_up": 4.0, "mean_down": 2.0}
+    radio = f'bits_per_second = {128 / AIR}, queue = "{queue}"'
+    scenario = scenario_of(radio, 200.0).replace({"network.lives": [lives]})
+    run = netkf.simulate(scenario, seed=4, engine=engine)
+    rows = run.events
+    falls = rows[rows.kind == "crash"]
+    free, arrivals, fell = {}, {}, 0
+    for row in rows[rows.kind == "transmit"].itertuples():
+        down = min(falls.t[(falls.node == row.node) & (falls.t > row.t)], default=np.inf)
+        begin = max(row.t, free.get(row.node, 0.0))
+        if begin > row.t and queue == "drop":
+            continue
+        free[row.node] = min(begin + AIR, down)
+        if begin + AIR <= down:
+            arrivals[row.node, row.message] = begin + AIR
+        else:
+            fell += 1
+    assert fell > 5
+    sent = rows[(rows.kind == "send") & (rows.node == 0) & (rows.peer == 1)]
+    told = {number: arrivals.get((0, number), np.inf) for number in sent.message}
+    heard = rows[(rows.kind == "deliver") & (rows.node == 1) & (rows.peer == 0)]
+    expected = {number: t for number, t in told.items() if t < 200.0}
+    assert dict(zip(heard.message, heard.t, strict=True)) == pytest.approx(expected, abs=1e-9)
+    lost = rows[(rows.kind == "lost") & (rows.node == 0) & (rows.peer == 1)]
+    assert set(lost.message) == {number for number, t in told.items() if t == np.inf}

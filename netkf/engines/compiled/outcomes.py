@@ -237,7 +237,7 @@ def list_outcomes(
         conditions = conditions_of(channel.loss, one, scenario.horizon)
         of_run_ticks = ticks[run * entities : (run + 1) * entities]
         shared = _shared_draws(scenario, one, senders, of_run_ticks)
-        waits = _waits(scenario, senders, of_run_ticks, moving and moving.heard)
+        waits = _waits(scenario, one, senders, of_run_ticks, moving and moving.heard)
         for e in range(entities):
             times = of_run_ticks[e]
             draws, last = (np.empty(0), np.empty(0), np.empty(0)), -1
@@ -302,6 +302,7 @@ def _shared_draws(
 
 def _waits(
     scenario: Scenario,
+    streams: Streams,
     senders: Senders,
     ticks: Sequence[FloatArray],
     heard: Sequence[np.ndarray] | None,
@@ -310,7 +311,7 @@ def _waits(
     found: dict[tuple[int, int], FloatArray] = {}
     if not scenario.messages_queue or scenario.network.radio is None:
         return found
-    airtime = Airtime(scenario.network.radio)
+    airtime = Airtime(scenario, streams)
     for node, owner, times in _transmissions(senders, ticks):
         speaks = np.full(len(times), heard is None)
         for e in np.unique(owner).tolist():

@@ -197,7 +197,7 @@ class SlotTables:
         if conditions is not None:
             self._first = [sent._replace(conditions=conditions) for sent in self._first]
         self._radio = scenario.network.radio
-        self._airtime = None if self._radio is None else Airtime(self._radio)
+        self._airtime = Airtime(scenario, streams) if self._radio else None
         self._follows = self._reach is not None and channel.loss.follows_distance
         senders = setup.senders
         samplers = [

@@ -92,8 +92,7 @@ class Transmitter:
         self._follows_distance = self._channel.loss.follows_distance
         self._alike = has_identical_links(self._channel)
         self._conditions = conditions_of(self._channel.loss, streams, scenario.horizon)
-        radio = scenario.network.radio
-        self._airtime = None if radio is None else Airtime(radio)
+        self._airtime = Airtime(scenario, streams) if scenario.network.radio else None
         # What hearers share is drawn for each transmission of a sender.
         self.broadcasts = broadcasts_of(scenario, streams)
         self._clocks = node_times(scenario, streams)
