@@ -29,9 +29,8 @@ def explain_failure(
     """
     if isinstance(error, KeyboardInterrupt) and directory is not None:
         return InterruptedRunError(directory)
-    # Errors of netkf name their cause already, and an OSError such as a full disk is not the fault
-    # of a user's class.
-    if not isinstance(error, Exception) or isinstance(error, (NetkfError, OSError)):
+    # Errors of netkf name their cause already.
+    if not isinstance(error, Exception) or isinstance(error, NetkfError):
         return error
     message = explain_user_error(scenario, error)
     where = "" if directory is None else f"; the traceback is in {directory / 'manifest.json'}"

@@ -87,7 +87,7 @@ def find_module_files(scenario: Component) -> dict[str, Path | None]:
 def explain_user_error(scenario: Any, error: Exception) -> str | None:
     """Return ``module:Class failed in method: error; file, line n`` for an error in a user's class:
     the deepest method of one in the traceback, or else the one that returned last, with its result.
-    None if all classes are netkf's own.
+    None if all classes are netkf's own, or what the operating system refuses was not asked by one.
     """
     components = user_components(scenario)
     if not components:
@@ -110,6 +110,8 @@ def explain_user_error(scenario: Any, error: Exception) -> str | None:
     if found is not None:
         cls, name, frame, line = found
         return f"{_name_of(cls)} failed in {name}: {text}; {source_line(frame.f_code, line)}"
+    if isinstance(error, OSError):  # such as a full disk
+        return None
     if isinstance(error, ContractError):
         return f"{_name_of(type(components[0]))}: {error}"
     call = last_call()
@@ -124,7 +126,7 @@ def explained(scenario: Any, make: Callable[[str], Exception]) -> Iterator[None]
     """Turn an error of a user's class in the body into what ``make`` makes of its explanation."""
     try:
         yield
-    except (NetkfError, OSError):  # they name their cause, and a full disk is not of the class
+    except NetkfError:  # it names its cause
         raise
     except Exception as error:
         rule = explain_user_error(scenario, error)

@@ -74,6 +74,13 @@ MISTAKES = {
     "a helper of absorb fails": (
         "FILTER", "def absorb(self, state, messages, exchange):\n    return [1 / 0 for _ in 'ab']",
         r"F failed in absorb: ZeroDivisionError.*; FILE, line 7"),
+    "a file of absorb is missing": (
+        "FILTER", "def absorb(self, state, messages, exchange): return open('gone.csv')",
+        r"F failed in absorb: FileNotFoundError: .*gone.csv.*; FILE, line 6"),
+    "an error of its own": (
+        "FILTER", "class Far(Exception):\n    def __init__(self, a, b): super().__init__(f'{a} of {b}')\n"
+        "def absorb(self, state, messages, exchange): raise self.Far(1, 2)",
+        r"F failed in absorb: Far: 1 of 2; FILE, line 8"),
     "absorb returns a number": ("FILTER", "def absorb(self, state, messages, exchange): return 3",
                                 r"F failed after absorb \(FILE, line 6\) returned 3: "),
     "update takes too little": ("FILTER", f"def update(self, state): return state\n{SAME}",

@@ -20,11 +20,32 @@ class Timeline(simpy.Environment):
     def __init__(self) -> None:
         super().__init__()
         self.processes = 0
+        self._failure: BaseException | None = None  # of a process
 
     def start(self, process: Generator[simpy.Event, Any, Any]) -> None:
         """Start a process; the order in which processes start does not matter."""
         self.processes += 1
-        self.process(process)
+        self.process(self._watched(process))
+
+    def _watched(
+        self, process: Generator[simpy.Event, Any, Any]
+    ) -> Generator[simpy.Event, Any, Any]:
+        try:
+            return (yield from process)
+        except BaseException as error:
+            self._failure = error
+            raise
+
+    def run(self, until: Any = None) -> Any:
+        """Run as SimPy does; raises what a process raised, of which SimPy raises a copy that is
+        made of its ``args`` alone.
+        """
+        try:
+            return super().run(until)
+        except BaseException:
+            if self._failure is not None:
+                raise self._failure from None
+            raise
 
     def at(self, time: float, rank: Rank | int, entity: int) -> simpy.Event:
         """Return an event at ``time`` (seconds), before those of higher (rank, entity): a
