@@ -313,7 +313,8 @@ def _waits(
         return found
     airtime = Airtime(scenario, streams)
     for node, owner, times in _transmissions(senders, ticks):
-        speaks = np.full(len(times), heard is None)
+        # A broadcast is sent even if nobody is in range.
+        speaks = np.full(len(times), heard is None or senders.at in ("nodes", "readings"))
         for e in np.unique(owner).tolist():
             for w in senders.outgoing[senders.first[e] : senders.first[e + 1]].tolist():
                 if heard is not None and senders.directions[w][0] == node:

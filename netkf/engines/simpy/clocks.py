@@ -192,6 +192,7 @@ def broadcasts(
         # A broadcast is one transmission, numbered by sender; its messages are numbered by link.
         recorder.append((now, TRANSMIT, node, -1, sent[node], -1, NAN))
         sent[node] += 1
+        transmitter.occupy(node)
         sends = zip(directions[node], outcomes, strict=True)
         for direction, outcome in itertools.compress(sends, heard):
             transmitter.send(direction, payload, outcome)

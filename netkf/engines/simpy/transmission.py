@@ -125,6 +125,11 @@ class Transmitter:
         if self.broadcasts is not None:
             self.broadcasts.begin(senders, fresh)
 
+    def occupy(self, sender: int) -> None:
+        """Let the radio of ``sender`` send its broadcast, whether or not anybody is in range."""
+        if self._airtime is not None:
+            self._airtime.end(sender, self._scenario.message_size(sender, -1), self._timeline.now)
+
     def connects(self, i: int, j: int) -> bool:
         """Return True if nodes ``i`` and ``j`` (ids) can hear each other now."""
         return self.reach is None or self.reach.connects(i, j, self._timeline.now)
