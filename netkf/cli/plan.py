@@ -62,7 +62,7 @@ def print_plan(
     # With a script on standard output, what a person reads goes beside it.
     out = sys.stderr if options.slurm else sys.stdout
     print(f"{what} for {count_phrase(tasks, 'job')}, none of them simulated", file=out)
-    quoted = shlex.quote(str(directory))
+    quoted = shlex.quote(str(directory)) + (" --trust" if options.trust else "")
     print(f"each: netkf work {quoted}; in the end: netkf merge {quoted}", file=out)
     print(f"written to {directory}", file=out)
     if options.slurm:

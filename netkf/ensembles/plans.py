@@ -56,7 +56,8 @@ class Plan(NamedTuple):
     @property
     def work_command(self) -> str:
         """The command that works on it, as a shell reads it."""
-        return shlex.join(["netkf", "work", str(self.directory)])
+        trust = ["--trust"] if getattr(self.scenario, "_trust", False) else []
+        return shlex.join(["netkf", "work", str(self.directory), *trust])
 
 
 def plan_ensemble(

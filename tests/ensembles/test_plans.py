@@ -415,6 +415,22 @@ def test_slurm_script(tmp_path, capsys):
     assert (done.returncode, done.stderr) == (0, "")
 
 
+def test_commands_that_a_plan_of_own_classes_names_trust_them(tmp_path, monkeypatch, capsys):
+    source = "from netkf.parts import Hybrid\n\n\nclass Own(Hybrid):\n    pass\n"
+    (tmp_path / "own.py").write_text(source)
+    shutil.copy(RING, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    line = ["plan", "poisson_ring.toml", "--trust", "--set", 'filter.kind="own:Own"', "--runs", "2"]
+    assert main([*line, "--set", "horizon=1.0", "--out", "plan"]) == 0
+    each, end = re.search(
+        r"each: netkf (.*); in the end: netkf (.*)\n", capsys.readouterr().out
+    ).groups()
+    assert main(shlex.split(end)) == 1
+    assert f"go on with netkf {each}, or" in capsys.readouterr().out
+    assert main(shlex.split(each)) == 0
+    assert main([*shlex.split(end), "--no-plot"]) == 0
+
+
 def test_no_plan_is_made_of_what_could_not_run(tmp_path, capsys):
     out = tmp_path / "out"
     assert (
