@@ -1,7 +1,10 @@
 """Classes that define something anew run beside the built-in one that they derive from."""
 
+import dataclasses
+
 import pytest
 
+from netkf.algorithms.filter import STEPS
 from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.registry import own_attributes
@@ -65,3 +68,29 @@ def test_what_should_be_the_same_and_is_not_is_broken(name, own, tmp_path):
     assert row.off > 1e-3
     assert own in row.evidence
     assert [one.replica for one in verdict.rows if one.verdict == BROKEN] == [0]
+
+
+def same(verb):
+    def method(self, *arguments):
+        return getattr(Hybrid, verb)(self, *arguments)
+
+    return method
+
+
+SAME = {
+    f"Same{verb}": dataclasses.dataclass(frozen=True, eq=False)(
+        type(f"Same{verb}", (Hybrid,), {verb: same(verb)} if verb else {})
+    )
+    for verb in ("", *STEPS)
+}
+globals().update(SAME)
+
+
+@pytest.mark.one_in(4)
+@pytest.mark.parametrize("name", SAME)
+def test_a_class_that_changes_nothing_is_not_accused(name, tmp_path):
+    chosen = {**RING["filter"], "kind": f"{__name__}:{name}"}
+    verdict = check(from_table({**RING, "filter": chosen}, tmp_path), 10, workers=1)
+    assert bool(verdict)
+    rows = [row.verdict for row in verdict.rows if row.promise == SAME_AS_BASE.statement]
+    assert rows == ([] if name == "Same" else [HOLDS])
