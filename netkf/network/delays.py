@@ -193,9 +193,9 @@ def draw_delays(delay: Delay, random: np.random.Generator, count: int) -> FloatA
 
 
 def draw_delay(delay: Delay, random: np.random.Generator) -> float:
-    """Return ``delay.draw`` in seconds; raises ScenarioError unless it is at least 0."""
+    """Return ``delay.draw`` in seconds; raises ScenarioError unless it is finite and at least 0."""
     seconds: Any = delay.draw(random)
-    if not (isinstance(seconds, float) and seconds >= 0.0):
+    if not (isinstance(seconds, float) and 0.0 <= seconds < math.inf):
         seconds = _SECONDS(f"network.channel.delay.{type(delay).__name__}.draw", seconds)
     return float(seconds)
 
@@ -209,22 +209,22 @@ def checked_delays(delay: Delay, sent: Transmission, drawn: FloatArray) -> Float
     """Return the seconds (K,) that K messages ``sent`` on a link take; see ``checked_delay``."""
     if is_vectorised(delay, "message_delay"):
         seconds = np.asarray(delay.message_delay(sent, drawn), dtype=np.float64)
-        if seconds.shape == drawn.shape and not (seconds < 0.0).any():
+        if seconds.shape == drawn.shape and not ((seconds < 0.0) | np.isinf(seconds)).any():
             return seconds
     ones = zip(each_message(sent), drawn.tolist(), strict=True)
     return np.array([checked_delay(delay, *one) for one in ones])
 
 
 def checked_delay(delay: Delay, sent: Transmission, drawn: float) -> float:
-    """Return the seconds that ``sent`` takes, nan if lost; raises ScenarioError if negative."""
+    """Return the seconds that ``sent`` takes, nan if lost; raises ScenarioError."""
     seconds: Any = delay.message_delay(sent, drawn)
     if not isinstance(seconds, float):  # a float32 would make times of its precision
         name = f"{type(delay).__name__}.message_delay"
         seconds = number()(f"network.channel.delay.{name}", seconds)
-    if seconds < 0.0:
+    if seconds < 0.0 or math.isinf(seconds):
         rule = (
             f"{type(delay).__name__}: the delay of message {sent.number} on link "
-            f"{list(sent.link)} must not be negative"
+            f"{list(sent.link)} must be finite and not negative"
         )
         remedy = "correct message_delay of the class"
         raise ScenarioError("network.channel.delay", rule, seconds, remedy)

@@ -157,6 +157,11 @@ MISTAKES = {
     "draw is negative": ("DELAY", "def draw(self, random): return -1.0",
                          r"delay\.F\.draw: must be a finite number at least 0; got -1\.0"),
     "draw is not a number": ("DELAY", "def draw(self, random): return float('nan')", r"F\.draw: must be a finite .*got nan"),
+    "draw never ends": ("DELAY", "def draw(self, random): return float('inf')", r"F\.draw: must be a finite .*got inf"),
+    "a message never arrives": (
+        "DELAY", "def draw(self, random): return 0.1\n"
+        "def message_delay(self, sent, drawn): return float('inf')",
+        r"F: the delay of message 0 on link .* must be finite and not negative; got inf"),
     "a fixed delay that is a text": ("DELAY", "fixed = '0.5'\ndef draw(self, random): return 0.5",
                                      r"F\.fixed: must be a finite number at least 0, or None; got '0\.5'"),
     "a share beyond 1": ("LOSS", "fate_share = 1.5", r"F\.fate_share: must be a finite number .*; got 1\.5"),
