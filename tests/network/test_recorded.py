@@ -113,7 +113,7 @@ def test_negative_delays_are_refused(record):
         def message_delay(self, sent, drawn):
             return -1.0
 
-    with pytest.raises(ScenarioError, match=r"Early: the delay of message 3 .* not be negative"):
+    with pytest.raises(ScenarioError, match=r"Early: the delay of message 3 .* and not negative"):
         transit_time(Channel(delay=Early()), Transmission(WAY, 3), FINE)
 
 

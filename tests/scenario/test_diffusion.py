@@ -34,7 +34,7 @@ REFUSALS = [
     refused(
         {"filter.weights": [[1.5, 0, 0], [-0.5, 1, 0], [0, 0, 1]]},
         "filter.weights[1][0]",
-        "must be finite and not negative; got -0.5",
+        "must not be negative; got -0.5",
     ),
     refused(
         {"filter.weights": [[0.5, 0, 0], [0.5, 1, 0], [0, 0, 1]]},
