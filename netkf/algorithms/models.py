@@ -285,17 +285,23 @@ class ChangingFlowModel(FlowModel):
     """A model in continuous time whose matrices change: the ``pieces`` of it, of which the first
     holds before ``changes[0]`` seconds, the second before ``changes[1]``, and so on. All fields are
     those of the present piece. Engines predict to each change, let the next piece ``begin``, and
-    say the time of what comes next by ``move_to``.
+    say the time of what comes next by ``move_to``. ``reads`` is False while the node is down, whose
+    sensors give no increments then.
     """
 
     pieces: Sequence[FlowModel]
     changes: Sequence[float]
     piece: int
     now: float
+    reads: bool
 
     def __init__(self, pieces: Sequence[FlowModel], changes: Sequence[float]) -> None:
-        self.__dict__.update(pieces=pieces, changes=changes, now=0.0)
+        self.__dict__.update(pieces=pieces, changes=changes, now=0.0, reads=True)
         self.begin(0)
+
+    def set_reading(self, reads: bool) -> None:
+        """Count increments in predictions from now on, or no more."""
+        self.__dict__["reads"] = reads
 
     def move_to(self, time: float) -> None:
         """Make ``time`` (seconds) the end of predictions."""
@@ -313,6 +319,8 @@ class ChangingFlowModel(FlowModel):
         """Return the estimate (n,) and the root (n, n) as ``FlowModel.predict``, ``gap`` seconds up
         to now.
         """
+        if not self.reads:
+            return self.extrapolate(xhat, root, gap)
         for model, length in self._parts(gap):
             xhat, root = model.predict(xhat, root, length)
         return xhat, root

@@ -207,7 +207,8 @@ class Surroundings:
         model, tables = self.model, self.struct.model
         if isinstance(model, ChangingFlowModel):
             self.struct.now, tables.piece = model.now, model.piece
-            tables.models[0] = model.piece * tables.stride
+            own = 0 if model.reads else tables.stride - 1
+            tables.models[0] = own + model.piece * tables.stride
         elif isinstance(model, RateModel):
             self.struct.now = model.now
         elif isinstance(model, ChangingSlotModel) and self._piece != model.piece:
@@ -424,6 +425,7 @@ def interval(state: NodeState) -> float:
     """Return the seconds of increments that ``update`` may use at once; inf in slots."""
     if not state.run.clocked:
         return math.inf
+    state.run.follow()
     run, interval = state.run.struct, state.kernels.interval
     return float(call_kernel(interval, state.record, 0, run=run, number=True))
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from netkf.algorithms.filter import compiled_kernels
+from netkf.algorithms.kernels import run as kalman
 from netkf.algorithms.kernels.gains import longest_interval
-from netkf.algorithms.kernels.run import absorb as nothing
 from netkf.core.clock import stated_rate
 from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.fields import Component
@@ -231,8 +231,19 @@ def _check_speed(scenario: DerivedScenario) -> None:
         )
 
 
+def _pauses_increments(scenario: DerivedScenario) -> bool:
+    """Return True if nodes of the filter can go without the increments of their sensors."""
+    algorithm = scenario.node_filter
+    kernels = compiled_kernels(algorithm, clocked=True)
+    known = kernels is None or (kernels.predict, kernels.update) == (kalman.predict, kalman.update)
+    return known and not algorithm.timing.pooled
+
+
 def _check_owners(scenario: DerivedScenario, name: str, entries: Sequence[Any]) -> None:
-    """Raise ScenarioError unless nodes are in one each of ``entries``, and take samples."""
+    """Raise ScenarioError unless nodes are in one each of ``entries``, and take samples where the
+    filter cannot go without increments for a time, or the clocks of nodes are wrong.
+    """
+    needs_samples = name == "clocks" or not _pauses_increments(scenario)
     owners: dict[int, int] = {}
     for k, entry in enumerate(entries):
         for node in entry.nodes:
@@ -240,10 +251,12 @@ def _check_owners(scenario: DerivedScenario, name: str, entries: Sequence[Any]) 
             if owners.setdefault(node, k) != k:
                 rule = f"must not have a node of network.{name}[{owners[node]}]"
                 raise ScenarioError(key, rule, node, "give each node one entry")
-            if node in scenario.increment_sensors:
+            if needs_samples and node in scenario.increment_sensors:
                 rule = (
                     "cannot have a node whose sensors give increments, only one where they sample"
                 )
+                if name == "lives":
+                    rule += f", with the {filter_name(scenario)}"
                 remedy = 'write sampling = { kind = "periodic", period = ... } in its [[sensors]]'
                 raise ScenarioError(key, rule, node, remedy)
     if owners and name == "clocks" and scenario.node_filter.timing.pooled:
@@ -334,7 +347,7 @@ def _check_quantisation(scenario: DerivedScenario) -> None:
         return
     algorithm, why = scenario.node_filter, None
     kernels = compiled_kernels(algorithm, not scenario.slotted)
-    if kernels is not None and (kernels.sends_readings or kernels.shift_payload is nothing):
+    if kernels is not None and (kernels.sends_readings or kernels.shift_payload is kalman.absorb):
         why = f"cannot be with the {filter_name(scenario)}, whose messages have readings or bits"
     elif scenario.plant.linear and scenario.knows_input:
         why = "cannot stand beside an input of a linear plant that filters know"

@@ -19,7 +19,14 @@ import scipy
 
 from netkf.algorithms.filter import NetworkInfo, NodeInfo, commutes
 from netkf.algorithms.kernels.gains import longest_interval
-from netkf.algorithms.models import FlowModel, MapModel, RateModel, SlotModel, changing_models
+from netkf.algorithms.models import (
+    ChangingFlowModel,
+    FlowModel,
+    MapModel,
+    RateModel,
+    SlotModel,
+    changing_models,
+)
 from netkf.algorithms.modes import rate_groups
 from netkf.algorithms.traits import Weights
 from netkf.core.errors import TheoryError
@@ -199,9 +206,22 @@ class DerivedScenario(ScenarioModel):
         return tuple(pieces)
 
     def model_of(self, entity: int) -> Any:
-        """Return the model of a node by index, 0 for a pooled filter; of a run if it changes."""
+        """Return the model of a node by index, 0 for a pooled filter; of a run if it changes, or if
+        increments come only while the node is up.
+        """
         changes = self.followed_slots if self.slotted else self.followed_changes.tolist()
-        return changing_models([(models[entity],) for models in self.model_pieces], changes)[0]
+        pieces = [models[entity] for models in self.model_pieces]
+        if self.nodes[entity] in self.waking_nodes and not changes:
+            return ChangingFlowModel(pieces, changes)
+        return changing_models([[model] for model in pieces], changes)[0]
+
+    @cached_property
+    def waking_nodes(self) -> frozenset[int]:
+        """The nodes (ids) that are down at times and have sensors that give increments."""
+        lives = self.network.lives
+        return frozenset(node for life in lives for node in life.nodes).intersection(
+            self.increment_sensors
+        )
 
     @property
     def followed_slots(self) -> tuple[int, ...]:

@@ -12,6 +12,7 @@ states all information of the sender, which replaces that of the receiver.
 
 from __future__ import annotations
 
+import bisect
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -33,6 +34,9 @@ refused ones were too old for the filter, unused ones were replaced by another m
 instant, or their receiver went down before it used them.
 """
 USED, LOST, LATE, REFUSED, UNDER_WAY, UNUSED = range(len(OUTCOMES))
+SLEEPS, WAKES = (
+    frozenset(CODES[kind] for kind in kinds) for kinds in (("crash", "leave"), ("restart", "join"))
+)
 ENDS = ("absorb", "swap", "crash", "leave")
 """Kinds of events after which nothing that arrived before waits at a node."""
 
@@ -283,6 +287,10 @@ class KeptReadings:
     def __init__(self, scenario: DerivedScenario, log: IntArray, at: float) -> None:
         self._scenario, self._times, self._at = scenario, log["t"], at
         sensed = np.flatnonzero(log["kind"] == CODES["sense"])
+        self._changes: dict[int, list[tuple[int, int]]] = {}
+        for row in np.flatnonzero(np.isin(log["kind"], (*SLEEPS, *WAKES))).tolist():
+            change = row, int(log["kind"][row])
+            self._changes.setdefault(int(log["node"][row]), []).append(change)
         # Sorted by node: the rows of a node are neighbours, in their order.
         nodes = log["node"][sensed]
         order = np.argsort(nodes, kind="stable")
@@ -310,11 +318,25 @@ class KeptReadings:
         if node not in self._rows:
             return np.nan
         if node in self._scenario.increment_sensors:
-            # Continuous readings are used up to the event at the end of the rows.
-            return float(self._times[end]) if end < len(self._times) else self._at
+            # Continuous readings are used up to the event at the end of the rows, or to the crash.
+            time = float(self._times[end]) if end < len(self._times) else self._at
+            return self._last_up(node, start, end, time)
         rows = self._rows[node]
         k = int(np.searchsorted(rows, end)) - 1
         return self.reading_time(int(rows[k])) if k >= 0 and rows[k] >= start else np.nan
+
+    def _last_up(self, node: int, start: int, end: int, time: float) -> float:
+        """Return when ``node`` was up last in rows ``start`` to ``end``, the last of which is at
+        ``time`` (s); nan if it was not.
+        """
+        changes = self._changes.get(node, [])
+        k = bisect.bisect_left(changes, (end, 0)) - 1
+        if k < 0:
+            return np.nan if changes and changes[0][1] in WAKES else time
+        row, kind = changes[k]
+        if kind in WAKES:
+            return time
+        return float(self._times[row]) if row >= start else np.nan
 
     def reading_time(self, row: int) -> float:
         """Return the time (s) at which the reading used at ``row`` was taken."""

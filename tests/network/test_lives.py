@@ -39,6 +39,7 @@ delay = {{ kind = "constant", seconds = 0.1 }}
 [filter]
 kind = "{filter}"
 """
+CONTINUOUS = CLOCKS.replace('sampling = {{ kind = "periodic", period = 0.5 }}\n', "")
 SLOTS = """
 format = 1
 name = "lives"
@@ -130,10 +131,75 @@ def test_covariances_are_those_of_the_plain_recursion(scenario_of, memory):
         np.testing.assert_allclose(run.P[:, k], expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize("at", ["nodes", "links", "directions"])
+def continuous_covariances(times, node, lost):
+    """The Kalman-Bucy filter of a node alone, whose sensor gives increments while it is up."""
+    A, Q = np.array([[-0.1, 1.0], [0.0, -0.3]]), np.diag([0.04, 1.0])
+    prior, H = np.array([[1.0, 0.2], [0.2, 2.0]]), np.array([[1.0, 0.0]])
+    changes = {1: [1.5, 4.5, 6.0, 7.25], 2: [3.0]}.get(node, [])
+    P, now, found = prior, 0.0, []
+    for t in sorted({*times, *changes}):
+        G = (0.0 if is_down(now, node) else 1.0) * H.T @ H / 0.3
+        big = scipy.linalg.expm(np.block([[A, Q], [G, -A.T]]) * (t - now))
+        P, now = (big[:2, :2] @ P + big[:2, 2:]) @ np.linalg.inv(big[2:, :2] @ P + big[2:, 2:]), t
+        if lost and t in changes and not is_down(t, node):
+            P = prior
+        if t in times:
+            found.append(P)
+    return np.array(found)
+
+
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
 @pytest.mark.parametrize("memory", ["kept", "lost"])
-def test_who_is_down_does_nothing(scenario_of, at, memory):
-    scenario = scenario_of(CLOCKS, *recorded(memory), at=at, filter_="hybrid")
+def test_continuous_sensors_are_silent_while_their_node_is_down(scenario_of, memory, engine):
+    scenario = scenario_of(CONTINUOUS, *recorded(memory))
+    run = netkf.simulate(scenario, seed=1, engine=engine)
+    exact = netkf.theory.error_covariance(scenario, run)
+    for k in range(3):
+        expected = continuous_covariances(run.times.tolist(), k, memory == "lost")
+        np.testing.assert_allclose(run.P[:, k], expected, rtol=1e-9)
+        if memory == "kept":  # else P begins again, and errors do not
+            np.testing.assert_allclose(exact[:, k], expected, rtol=1e-8)
+
+
+@pytest.mark.parametrize("memory", ["kept", "lost"])
+@pytest.mark.parametrize("filter_", ["hybrid", "gossip"])
+def test_engines_agree_where_continuous_sensors_fall_silent(scenario_of, filter_, memory):
+    at = "links" if filter_ == "gossip" else "nodes"
+    scenario = scenario_of(CONTINUOUS, *recorded(memory), at=at, filter_=filter_)
+    changing = [{"from": 5.0, "A": [[-0.2, 0.3], [0.0, -0.5]]}]
+    driven = {"kind": "constant", "G": [[1.0], [0.5]], "value": [0.7]}
+    for changes in ({}, {"plant.schedule": changing}, {"plant.input": driven}):
+        run = assert_agree(scenario.replace(changes))
+        assert run.count("crash") + run.count("leave") == 2
+
+
+def test_errors_where_continuous_sensors_fall_silent(scenario_of):
+    """Squared errors of many runs have the mean that the exact covariances of each give them."""
+    scenario = scenario_of(CONTINUOUS, *recorded(), filter_="hybrid")
+    excess = []
+    for replica in range(60):
+        run = netkf.simulate(scenario, seed=5, replica=replica)
+        exact = np.einsum("tnii->tn", netkf.theory.error_covariance(scenario, run))
+        excess.append([(run.error**2).sum(axis=2).mean() - exact.mean(), exact.mean()])
+    mean, size = np.mean(excess, axis=0)
+    deviation = np.std(excess, axis=0)[0] / np.sqrt(len(excess))
+    assert abs(mean) < 4.0 * deviation < 0.5 * size
+
+
+def test_only_nodes_that_go_without_increments_may_be_down(scenario_of):
+    rule = (
+        r"network\.lives\[0\]\.nodes: cannot have .* they sample, with the central filter; got 1;"
+    )
+    with pytest.raises(netkf.ScenarioError, match=rule):
+        scenario_of(CONTINUOUS, *recorded(), filter_="central")
+
+
+@pytest.mark.parametrize("at", ["nodes", "links", "directions"])
+@pytest.mark.parametrize(
+    ("text", "memory"), [(CLOCKS, "kept"), (CLOCKS, "lost"), (CONTINUOUS, "kept")]
+)
+def test_who_is_down_does_nothing(scenario_of, text, at, memory):
+    scenario = scenario_of(text, *recorded(memory), at=at, filter_="hybrid")
     log = netkf.simulate(scenario, seed=3).log
     for kind in ("sense", "send", "absorb", "transmit"):
         rows = log[log["kind"] == CODES[kind]]
@@ -589,7 +655,9 @@ def test_no_lives_is_todays_run(scenario_of):
 
 @pytest.mark.one_in(2)
 @pytest.mark.parametrize("memory", ["kept", "lost"])
-@pytest.mark.parametrize(("text", "filter_"), [(CLOCKS, "hybrid"), (SLOTS, "diffusion")])
+@pytest.mark.parametrize(
+    ("text", "filter_"), [(CLOCKS, "hybrid"), (CONTINUOUS, "hybrid"), (SLOTS, "diffusion")]
+)
 def test_check_holds_a_run_to_the_promises_that_survive(scenario_of, text, filter_, memory):
     scenario = scenario_of(text, *recorded(memory), filter_=filter_)
     verdict = netkf.check(scenario, runs=20)
@@ -714,7 +782,7 @@ def test_the_central_filter_misses_what_nodes_that_are_down_do_not_read(scenario
         assert netkf.check(scenario, runs=20)
 
 
-@pytest.mark.parametrize("text", [SLOTS, CLOCKS], ids=["slots", "clocks"])
+@pytest.mark.parametrize("text", [SLOTS, CLOCKS, CONTINUOUS], ids=["slots", "clocks", "continuous"])
 def test_no_theory_counts_readings_of_nodes_that_are_down(scenario_of, text, tmp_path):
     lives = '[[network.lives]]\nnodes = [0]\nkind = "duty"\nperiod = 4.0\nup = 2.0\n'
     scenario = scenario_of(text, lives)

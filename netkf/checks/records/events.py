@@ -20,6 +20,7 @@ from netkf.network.clocks import LinkClock, OnReadings
 from netkf.network.matchings import RecordedSlots
 from netkf.plants.recorded import RecordedSensor
 from netkf.rng.streams import Streams
+from netkf.runs.outcomes import downtimes
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES, KINDS, rows_of
@@ -235,13 +236,16 @@ def _read(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
     plant = scenario.plant
     period = (scenario.diffusion.sensing_period if plant.linear else None) or math.inf
     senses = log[log["kind"] == SENSE]
+    down = downtimes(scenario, run.seed, run.replica)
     for node in scenario.sensing_nodes:
         times = [times for (owner, _), times in sampled.items() if owner == node]
         expected = np.unique(np.concatenate([np.empty(0), *times]))
         if node in scenario.increment_sensors:
             count = math.ceil(scenario.horizon / period * (1.0 + TIME_TOLERANCE))
             grid = period * np.arange(1, count + 1)
-            expected = np.sort(np.concatenate([expected, grid[grid < scenario.horizon]]))
+            asleep = [(grid >= d.begin) & (grid < d.end) for d in down if d.node == node]
+            grid = grid[~np.any([grid >= scenario.horizon, *asleep], axis=0)]
+            expected = np.sort(np.concatenate([expected, grid]))
         taken = senses["t"][senses["node"] == node]
         yield from _compare_times(log, "sense", node, taken, expected, scenario.horizon)
 

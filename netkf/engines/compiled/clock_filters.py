@@ -83,6 +83,7 @@ class ClockFilters:
         self.record, self.start = self.records.struct, self.records.copied()
         self.quantiser = PayloadQuantiser(scenario.network.quantise, self.records)
         self._first_models = np.ascontiguousarray(start.nodes["model"])
+        self._silent = np.zeros(len(start.nodes), dtype=bool)
         self.run = self._run_of(scenario, start, links, messages)
         self._run = self.run.general
         reads = bool((start.nodes["sensors"] > start.nodes["sensor"]).any())
@@ -133,6 +134,7 @@ class ClockFilters:
     def begin(self, instants: Instants) -> None:
         """Go back to time 0, for a run whose sensors take samples at these ``instants``."""
         copy_arrays(self.record, self.start)
+        self._silent[:] = False
         self.begin_piece(0)
         # Rows of the reading of each sample, then the largest sum over one instant.
         rows = np.concatenate([instants.rows, [0]])[instants.sensor]
@@ -161,7 +163,14 @@ class ClockFilters:
         model = self.run.model
         if self._rates:
             return
-        model.piece, model.models[:] = piece, self._first_models + piece * model.stride
+        # The last model of a piece has no sensors.
+        own = np.where(self._silent, model.stride - 1, self._first_models)
+        model.piece, model.models[:] = piece, own + piece * model.stride
+
+    def set_reading(self, h: int, reads: bool) -> None:
+        """Let node ``h`` count its increments in predictions from now on, or no more."""
+        self._silent[h] = not reads
+        self.begin_piece(self.run.model.piece)
 
     @property
     def estimates(self) -> tuple[FloatArray, FloatArray]:

@@ -270,10 +270,12 @@ def predict_node(
         # The increments of a gap are an observation at its end.
         run.gap = end - now
         call_at(verbs.predict, record, h, run)
+        # A node that is down does not use them: what others read must not depend on it.
         fill_readings(state, state.run, h, state.piece, now, end, moments)
-        model.increments = 1
-        call_at(verbs.update, record, h, run)
-        model.increments = 0
+        if node.down == 0:
+            model.increments = 1
+            call_at(verbs.update, record, h, run)
+            model.increments = 0
         now = end
 
 

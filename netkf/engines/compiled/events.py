@@ -121,7 +121,7 @@ def count_participants(state: Simulation, event: int) -> int:
     if event in (ON_REBASE, ON_PROBE):
         count = len(state.nodes)
     # A delivery changes an inbox only: the receiver is predicted when it absorbs.
-    elif event in (ON_DELIVER, ON_LIFE):
+    elif event == ON_DELIVER or (event == ON_LIFE and state.waking[state.life_at] < 0):
         count = 0
     elif event == ON_TICK and state.clock_kind == LINKS:
         # Both ends of a link.
@@ -143,6 +143,8 @@ def participant(state: Simulation, event: int, k: int) -> int:
         if state.absorbing == 0:
             sort_indices(state.waiting, state.receivers)
         return int(state.waiting[state.absorbing])
+    if event == ON_LIFE:
+        return int(state.waking[state.life_at])
     if event == ON_SENSE:
         return int(state.sensing.index[state.wake_at])
     if event == ON_SAMPLE:
@@ -213,7 +215,8 @@ def on_sense(state: Simulation, now: float) -> None:
     point of the sensing grid.
     """
     sensing = state.sensing
-    record_event(state, now, SENSE, sensing.node[state.wake_at], -1, -1)
+    if state.nodes[sensing.index[state.wake_at]].down == 0:
+        record_event(state, now, SENSE, sensing.node[state.wake_at], -1, -1)
     state.wake_at += 1
     # At each point of the grid all nodes with increment sensors read, one event for each.
     if state.wake_at == len(sensing.index):

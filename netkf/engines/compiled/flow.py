@@ -232,6 +232,11 @@ class Workspace:
             nodes["offset"][place], nodes["pace"][place] = clock.offset, clock.pace
         n = start.xhat.shape[1]
         xhat, root = self._begin_estimates(instants, together)
+        waking = [self._scenario.topology.index[node] for node in self._scenario.waking_nodes]
+        for h in waking:
+            assert self.clocked is not None
+            self.clocked.set_reading(h, not nodes["down"][h])
+        lives = draws.lives
         state: Simulation = (Simulation.of_size(n) if self._unrolled else Simulation)(
             size=sized(n) if self._unrolled else np.zeros(n),
             plant=sized(n) if self._unrolled else np.zeros(self._scenario.plant.n),
@@ -255,7 +260,8 @@ class Workspace:
             ticks_stop=len(window.t),
             # Plants that change have no frames.
             frames=draws.states.frame_times if not len(changes) else changes,
-            lives=draws.lives.t,
+            lives=lives.t,
+            waking=np.where(np.isin(lives.node, waking), lives.node, -1),
             quantiser=self._quantiser.with_streams(draws.dither),
             probes=self._probes,
             buffer=self._buffer if buffer is None else buffer,
@@ -404,6 +410,9 @@ class FlowRun:
             state.counts[kind] += 1
         if lives.in_nodes:
             state.nodes["down"][h] ^= 1
+        if state.waking[k] >= 0:
+            assert self._clocked is not None
+            self._clocked.set_reading(h, not state.nodes["down"][h])
         if lives.restarts[k]:
             assert self._clocked is not None
             self._clocked.restart(h, self._scenario.prior_shift(node, time))

@@ -257,7 +257,8 @@ class Simulation(Struct):
                                               outcomes begin
     link_at : the next change of a link, of those in ``ticks``
     frames, frame_at : times (F,) at which frames begin
-    lives, life_at : times (K,) at which nodes go up or down
+    lives, waking, life_at : times (K,) at which nodes go up or down, and the index of each if it
+                             reads increments while it is up, else -1
     quantiser, clipped : how payloads are quantised, and how many numbers of the message that is
                          being sent were clipped
     probes, probe_at : times (T,) of samples
@@ -297,6 +298,7 @@ class Simulation(Struct):
     ticks: TickArrays
     frames: FloatArray
     lives: FloatArray
+    waking: IntArray
     quantiser: Quantiser
     probes: FloatArray
     buffer: SampleBuffer

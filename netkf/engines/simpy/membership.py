@@ -34,6 +34,8 @@ class Membership:
 
     def processes(self, timeline: Timeline, nodes: dict[int, Any]) -> list[Process]:
         """Return a process for each node that goes up or down in the run."""
+        for node in self._down:
+            nodes[node].set_up(False, 0.0)
         return [
             self._live(timeline, node, life, nodes[node])
             for node, life in self._lives.items()
@@ -47,6 +49,7 @@ class Membership:
             code = CODES[change.kind]
             if change.time < self._horizon:
                 self._recorder.append((change.time, code, node, -1, -1, -1, NAN))
+            carrier.set_up(change.up, change.time)
             if change.up:
                 self._down.remove(node)
                 if life.forgets:

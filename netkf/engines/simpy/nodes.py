@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -220,6 +221,9 @@ class Node:
         """Begin again at ``time`` seconds with the estimate ``fresh(time)``, of a slot in slots."""
         self.state = self.algorithm.init(self.model, *fresh(time), self.info)
 
+    def set_up(self, up: bool, time: float) -> None:
+        """Go up or down at ``time`` (seconds)."""
+
     def _predict(self, start: float, gap: float) -> None:
         """Predict the filter over ``gap`` seconds from ``start`` on."""
         if isinstance(self.model, DrivenModel):
@@ -388,7 +392,7 @@ class ClockedNode(Node):
     ) -> None:
         super().__init__(*arguments)
         self._timeline, self._recorder, self._truth = timeline, recorder, truth
-        self._increments, self._clock = increments, clock
+        self._increments, self._clock, self._reads = increments, clock, True
         # The time in seconds by its clock, to which the filter is predicted.
         self._now = clock.shows(0.0)
         # The samples of the present instant, until the update that uses all of them.
@@ -403,6 +407,15 @@ class ClockedNode(Node):
         """Begin again at ``time`` seconds with the estimate ``fresh(time)``."""
         super().restart(time, fresh)
         self._now = self._clock.shows(time)
+
+    def set_up(self, up: bool, time: float) -> None:
+        """Use increments from ``time`` (seconds) on, or no more; a filter that all nodes share has
+        none of nodes that go down.
+        """
+        if self._increments and self.node >= 0:
+            self.predict_to(time)
+            self._reads = up
+            self.moving_model.set_reading(up)
 
     def predict_to(self, time: float) -> None:
         """Predict the filter to ``time`` (seconds), using the increments since its last event; what
@@ -421,7 +434,7 @@ class ClockedNode(Node):
         min_interval = MIN_GAP_SHARE * (time - self._now)
         while self._now < time:
             end = time
-            interval = self._interval(self.state)
+            interval = self._interval(self.state) if self._reads else math.inf
             if interval < time - self._now:
                 # P changes too much over the whole gap: use the increments of a part of it.
                 end = interval_end(self._now, time, max(interval, min_interval))
@@ -431,7 +444,8 @@ class ClockedNode(Node):
             self._predict(self._now, gap)
             moments = self._read(self._now, end)
             # The two moments of the increments, with the gains for a gap of this length.
-            self.state = self.algorithm.update(self.state, Increments(moments, gap))
+            if self._reads:
+                self.state = self.algorithm.update(self.state, Increments(moments, gap))
             self._now = end
 
     def _read(self, start: float, end: float) -> FloatArray:

@@ -40,7 +40,9 @@ def sensor_processes(
     index = scenario.topology.index
     processes = [
         # One process for all increment sensors of a node: they are read at the same times.
-        _increment_process(scenario, timeline, recorder, truth, nodes[node], node, index[node])
+        _increment_process(
+            scenario, timeline, recorder, truth, nodes[node], (node, index[node]), up
+        )
         for node in scenario.increment_sensors
     ]
     times, entity = scenario.sample_times(streams), 0
@@ -62,15 +64,17 @@ def _increment_process(
     recorder: Recorder,
     truth: Any,
     carrier: ClockedNode,
-    node: int,
-    entity: int,
+    ids: tuple[int, int],
+    up: Callable[[int], bool],
 ) -> Process:
+    node, entity = ids
     # From grid point 1 on, since increments need an interval.
     k = 1
     # Half open: the horizon is excluded.
     while (time := truth.grid(k)) < scenario.horizon:
         yield timeline.at(time, Rank.SENSE, entity)
-        recorder.append((time, SENSE, node, -1, -1, -1, NAN))
+        if up(node):
+            recorder.append((time, SENSE, node, -1, -1, -1, NAN))
         # predict_to() uses the increments up to now.
         carrier.predict_to(time)
         k += 1

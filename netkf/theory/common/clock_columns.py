@@ -27,9 +27,10 @@ from netkf.theory.common.observations import Observation, timed_observations
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
-SENSE, SEND, DELIVER, ABSORB, TRANSMIT, RESTART, JOIN = (
-    CODES[kind] for kind in ("sense", "send", "deliver", "absorb", "transmit", "restart", "join")
+SENSE, SEND, DELIVER, ABSORB, TRANSMIT = (
+    CODES[kind] for kind in ("sense", "send", "deliver", "absorb", "transmit")
 )
+CRASH, LEAVE, RESTART, JOIN = (CODES[kind] for kind in ("crash", "leave", "restart", "join"))
 
 LARGE, CHECKS = 1e4, 256
 """Size of the true state, in standard deviations of an error, from which on the origin moves, and
@@ -86,6 +87,9 @@ class ClockColumns(LoggedColumns):
         rate = max(np.abs(plant.A).sum(axis=0).max(), CHECKS / scenario.horizon)
         movable = not len(plant.changes) and np.array_equal(scenario.belief[0], plant.A)
         self._forgetful = frozenset(scenario.forgetful_nodes)
+        # Estimators (indices) whose continuous sensors are silent, as their nodes are down.
+        waking = {self._index[node] for node in scenario.waking_nodes}
+        self._silent = {h for h in waking if self._lives.down[h]}
         # A node that begins again does so with a mean that does not move along, and one whose clock
         # is wrong is at another time.
         movable = movable and not (self._forgetful or self._clocks or scenario.views)
@@ -110,7 +114,26 @@ class ClockColumns(LoggedColumns):
         if piece < len(self._scenario.model_pieces):
             self._filters.clocked.begin_piece(piece)
         self._lay_laws(piece)
-        self._flows: IncrementFlows | None = increment_flows(self._scenario, self.estimators, piece)
+        self._begin_flows()
+
+    def _begin_flows(self) -> None:
+        """Let increments reach those that are not silent from now on."""
+        for node in self._scenario.waking_nodes:
+            h = self._index[node]
+            self._filters.clocked.set_reading(h, h not in self._silent)
+        self._flows: IncrementFlows | None = increment_flows(
+            self._scenario, self.estimators, self._piece, self._silent
+        )
+
+    def _change_life(self, node: int, time: float) -> None:
+        """Let the continuous sensors of a node (id) fall silent at ``time`` (s), or read again."""
+        h = self._index[node]
+        self._move_truth(time)
+        gap = self._gap(h, time)
+        if gap > 0.0:
+            self._filters.predict(h, gap)
+        self._silent ^= {h}
+        self._begin_flows()
 
     def _move_all(self, time: float) -> None:
         self._move_truth(time)
@@ -138,7 +161,9 @@ class ClockColumns(LoggedColumns):
             self._inboxes.setdefault(node, []).append(self._sent.pop((peer, node, message)))
         elif kind == ABSORB and node in self._inboxes:
             self._absorb(node, time)
-        elif kind in (RESTART, JOIN) and node in self._forgetful:
+        elif kind in (CRASH, LEAVE, RESTART, JOIN) and node in self._scenario.waking_nodes:
+            self._change_life(node, time)
+        if kind in (RESTART, JOIN) and node in self._forgetful:
             self._times[self._index[node]] = self._clock_reading(self._index[node], time)
             self._filters.restart(self._index[node], self._scenario.prior_shift(node, time))
 

@@ -7,6 +7,7 @@ the verbs of filters go in short steps.
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -112,9 +113,15 @@ def integration_steps(scenario: Scenario) -> int:
     return math.ceil(scenario.horizon / min(units)) if units else 0
 
 
-def increment_flows(scenario: Scenario, estimators: int, piece: int = 0) -> IncrementFlows | None:
-    """Return how errors with increments evolve in a ``piece`` of the plant; None without any."""
+def increment_flows(
+    scenario: Scenario, estimators: int, piece: int = 0, silent: Collection[int] = ()
+) -> IncrementFlows | None:
+    """Return how errors with increments evolve in a ``piece`` of the plant, of estimators but those
+    that are ``silent`` (indices); None without any.
+    """
     observations = increment_observations(scenario)
+    for h in silent:
+        observations[h] = observations[h]._replace(H=observations[h].H[:0])
     if not any(len(observation.H) for observation in observations):
         return None
     kernels = compiled_kernels(scenario.node_filter, clocked=True)

@@ -137,6 +137,7 @@ def central_covariance(scenario: Scenario) -> FloatArray:
         raise TheoryError(
             "no steady value: with sampled sensors it goes up and down with the samples"
         )
+    require_every_reading(scenario)
     G = np.zeros((scenario.plant.n, scenario.plant.n))
     for node in scenario.sensing_nodes:
         H, R = scenario.observation_matrices(node)
