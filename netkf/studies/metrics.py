@@ -181,6 +181,7 @@ def central_traces(scenario: Scenario) -> FloatArray:
     """
     if randomly_sampled_sensors(scenario):
         raise TheoryError("sensors sample at random times: the central filter has a bound, no P")
+    require_every_reading(scenario)
     network = dataclasses.replace(scenario.network, clocks=())
     filtering = Filtering(algorithm=Central())
     central = dataclasses.replace(scenario, filter=filtering, network=network)
