@@ -116,9 +116,6 @@ def _check_range(scenario: Scenario, key: str, low: float, high: float) -> bool:
     """Return whether the ``key`` has integers as values; raises ScenarioError for a bad range."""
     if not isinstance(key, str):
         raise ScenarioError("--vary", "needs a key, as filter.epsilon", key, "give its path")
-    if key == "seed":
-        rule = "cannot be the seed: no quantity grows with it"
-        raise ScenarioError("--vary", rule, key, "vary a key such as network.activation.rate")
     is_integer = is_integer_key(scenario, key)
     for name, end in (("low", low), ("high", high)):
         number()(name, end)

@@ -127,7 +127,6 @@ def test_grids_are_lists_ranges_tables_and_words():
         (["size", RING, "--vary", f"{RATE}=1:nan", "--target", "mean_rms<=1"], "must be LOW:HIGH"),
         (["size", RING, "--vary", f"{RATE}=-1:2", "--target", "mean_rms<=1"], "above 0"),
         (["size", RING, "--vary", "name=1:2", "--target", "mean_rms<=1"], "must be a number in"),
-        (["size", RING, "--vary", "seed=1:9", "--target", "mean_rms<=1"], "cannot be the seed"),
         (["size", RING, "--vary", "plant.C=1:2", "--target", "mean_rms<=1"], "is not a key of"),
         (
             ["size", RING, "--vary", "network.graph.nodes=4.5:8", "--target", "mean_rms<=1"],
