@@ -40,15 +40,17 @@ class Call(NamedTuple):
 
 
 class _Last:
-    """The last call of any method of a user's class that has returned."""
+    """The last call of any method of a user's class that has returned, or the first whose result
+    has an xhat of another shape than its state: what fails later fails because of it.
+    """
 
     call: Call | None = None
+    reshaped = False
 
 
 def last_call() -> Call | None:
-    """Return the last call of a method of a user's class that has returned, None before the
-    first.
-    """
+    """Return the call after which something failed, None before the first."""
+    _Last.reshaped = False
     return _Last.call
 
 
@@ -283,7 +285,13 @@ def _watched(cls: type, own: FunctionType, contract: FunctionType) -> Any:
             result = own(self, *arguments, **options)
         except SystemExit as error:  # it would end the command without a word
             raise ContractError(f"{describe_method(cls, own)} called exit") from error
-        _Last.call = Call(cls, own, result)
+        if not _Last.reshaped:
+            _Last.call = Call(cls, own, result)
+            states = (
+                *arguments[:1],
+                *(result[:1] if length and isinstance(result, tuple) else [result]),
+            )
+            _Last.reshaped = len({*map(_shape, states)} - {None}) > 1
         rule = ""
         if result is None and not is_optional:
             rule = "returned nothing; it must return a value"
@@ -296,6 +304,10 @@ def _watched(cls: type, own: FunctionType, contract: FunctionType) -> Any:
         return result
 
     return watched
+
+
+def _shape(state: Any) -> tuple[int, ...] | None:
+    return getattr(getattr(state, "xhat", None), "shape", None)
 
 
 def _count(inner: str) -> int:

@@ -81,6 +81,11 @@ MISTAKES = {
         "FILTER", "class Far(Exception):\n    def __init__(self, a, b): super().__init__(f'{a} of {b}')\n"
         "def absorb(self, state, messages, exchange): raise self.Far(1, 2)",
         r"F failed in absorb: Far: 1 of 2; FILE, line 8"),
+    # Node 0 has a reading; the others, whose absorb is called after, return what they should.
+    "absorb returns an xhat of another shape": (
+        "FILTER", "def absorb(self, state, messages, exchange):\n"
+        "    return state._replace(xhat=np.ones(2)) if state.xhat[0] else state",
+        r"F failed after absorb \(FILE, line 6\) returned State\(xhat=array\(\[1\., 1\.\]\)"),
     "absorb returns a number": ("FILTER", "def absorb(self, state, messages, exchange): return 3",
                                 r"F failed after absorb \(FILE, line 6\) returned 3: "),
     "update takes too little": ("FILTER", f"def update(self, state): return state\n{SAME}",
