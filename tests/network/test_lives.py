@@ -177,7 +177,7 @@ def test_errors_where_continuous_sensors_fall_silent(scenario_of):
     """Squared errors of many runs have the mean that the exact covariances of each give them."""
     scenario = scenario_of(CONTINUOUS, *recorded(), filter_="hybrid")
     excess = []
-    for replica in range(60):
+    for replica in range(30):
         run = netkf.simulate(scenario, seed=5, replica=replica)
         exact = np.einsum("tnii->tn", netkf.theory.error_covariance(scenario, run))
         excess.append([(run.error**2).sum(axis=2).mean() - exact.mean(), exact.mean()])
