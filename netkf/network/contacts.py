@@ -57,10 +57,10 @@ class Contacts(LinkClock):
     @cached_property
     def _table(self) -> Columns:
         table = read_columns(self.path, ("from", "until", "node", "peer"))
-        wrong = np.flatnonzero(table["until"] <= table["from"])
+        wrong = np.flatnonzero(table["until"] < table["from"])
         if wrong.size:
             row = int(wrong[0])
-            rule = f"{table.where(row)}: until must be after from"
+            rule = f"{table.where(row)}: until must not be before from"
             interval = [float(table["from"][row]), float(table["until"][row])]
             raise ScenarioError("path", rule, interval, "correct the row")
         return table

@@ -192,8 +192,15 @@ def test_check_knows_the_intervals(cls, broken, make):
         assert not (table == "broken").any()
 
 
+def test_a_contact_of_an_instant_has_the_tick_of_that_instant(make, tmp_path):
+    """Both ends count, and logs of scans have contacts that were seen once."""
+    (tmp_path / "contacts.csv").write_text("from,until,node,peer\n8,8,0,1\n9.1,9.1,0,1\n")
+    _, contacts = make(CLOCKS["periodic"])
+    assert ticks_of(netkf.simulate(contacts), (0, 1)) == [8.0]
+
+
 WRONG = {
-    "ends first": ("from,until,node,peer\n3,2,0,1\n", {}, "line 2: until must be after from"),
+    "ends first": ("from,until,node,peer\n3,2,0,1\n", {}, "line 2: until must not be before from"),
     "no link": ("from,until,node,peer\n1,2,0,3\n", {}, "line 2: every pair must be a link"),
     "no end": ("from,node,peer\n1,0,1\n", {}, "columns from, until, node, peer"),
     "nodes": (ROWS, {"at": "nodes"}, "at: must be links or directions"),
