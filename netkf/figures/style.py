@@ -240,4 +240,6 @@ def set_scale(axes: Any, values: FloatArray, levels: Sequence[float] = ()) -> No
         axes.set_ylim(positive.min() * 0.7, positive.max() * 1.5)
         axes.set_yscale("log")
     elif positive.size:
-        axes.set_ylim(0.0, positive.max() * 1.06)
+        # With the bands that are drawn, unless they are so wide that curves would be flat.
+        top = np.clip(axes.dataLim.y1, positive.max(), 1.5 * positive.max())
+        axes.set_ylim(0.0, 1.06 * top)
