@@ -54,7 +54,7 @@ from netkf.engines.compiled.state import (
 from netkf.engines.compiled.ticks import Schedule
 from netkf.engines.compiled.truth import PathStates
 from netkf.engines.compiled.visits import Visits, empty_visits
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.lanes import with_spare
 from netkf.linalg.structs import sized
 from netkf.network.node_clocks import node_times
@@ -232,11 +232,7 @@ class Workspace:
             nodes["offset"][place], nodes["pace"][place] = clock.offset, clock.pace
         n = start.xhat.shape[1]
         xhat, root = self._begin_estimates(instants, together)
-        waking = [self._scenario.topology.index[node] for node in self._scenario.waking_nodes]
-        for h in waking:
-            assert self.clocked is not None
-            self.clocked.set_reading(h, not nodes["down"][h])
-        lives = draws.lives
+        lives, waking = draws.lives, self._begin_reading(nodes["down"])
         state: Simulation = (Simulation.of_size(n) if self._unrolled else Simulation)(
             size=sized(n) if self._unrolled else np.zeros(n),
             plant=sized(n) if self._unrolled else np.zeros(self._scenario.plant.n),
@@ -275,6 +271,16 @@ class Workspace:
             **dict.fromkeys(AT_START, 0),
         )
         return state
+
+    def _begin_reading(self, down: IntArray) -> list[int]:
+        """Return the nodes (indices) that read increments while they are up, after those that are
+        ``down`` (N,) have stopped.
+        """
+        waking = [self._scenario.topology.index[node] for node in self._scenario.waking_nodes]
+        for h in waking:
+            assert self.clocked is not None
+            self.clocked.set_reading(h, not down[h])
+        return waking
 
     def _scalar_fields(self, instants: Instants) -> dict[str, Any]:
         algorithm = self._scenario.node_filter
