@@ -71,6 +71,11 @@ class FlowModel:
     horizon: float
     interval: float
 
+    reads: ClassVar[bool] = True
+    """False while the node is down, whose sensors give no increments then; of a node that may be
+    down engines say it by ``ChangingFlowModel.set_reading``.
+    """
+
     @cached_property
     def information(self) -> FloatArray:
         """The information rate ``G = H' R^-1 H`` (n, n) of the node's sensors, per second."""
@@ -285,18 +290,16 @@ class ChangingFlowModel(FlowModel):
     """A model in continuous time whose matrices change: the ``pieces`` of it, of which the first
     holds before ``changes[0]`` seconds, the second before ``changes[1]``, and so on. All fields are
     those of the present piece. Engines predict to each change, let the next piece ``begin``, and
-    say the time of what comes next by ``move_to``. ``reads`` is False while the node is down, whose
-    sensors give no increments then.
+    say the time of what comes next by ``move_to``.
     """
 
     pieces: Sequence[FlowModel]
     changes: Sequence[float]
     piece: int
     now: float
-    reads: bool
 
     def __init__(self, pieces: Sequence[FlowModel], changes: Sequence[float]) -> None:
-        self.__dict__.update(pieces=pieces, changes=changes, now=0.0, reads=True)
+        self.__dict__.update(pieces=pieces, changes=changes, now=0.0)
         self.begin(0)
 
     def set_reading(self, reads: bool) -> None:

@@ -201,6 +201,11 @@ class Kernels:
         return self.sends_readings and self.shift_payload is not standard.absorb
 
     @property
+    def is_kalman(self) -> bool:
+        """True if between exchanges nodes are Kalman filters on own readings."""
+        return (self.predict, self.update) == (standard.predict, standard.update)
+
+    @property
     def is_convex(self) -> bool:
         """True if nodes are Kalman filters that form convex combinations, and nothing else."""
         return replace(self, unrolled=False) == Kernels(absorb=combine_convex)

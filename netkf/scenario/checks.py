@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from netkf.algorithms.filter import compiled_kernels
-from netkf.algorithms.kernels import run as kalman
 from netkf.algorithms.kernels.gains import longest_interval
+from netkf.algorithms.kernels.run import absorb as nothing
 from netkf.core.clock import stated_rate
 from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.fields import Component
@@ -235,8 +235,7 @@ def _pauses_increments(scenario: DerivedScenario) -> bool:
     """Return True if nodes of the filter can go without the increments of their sensors."""
     algorithm = scenario.node_filter
     kernels = compiled_kernels(algorithm, clocked=True)
-    known = kernels is None or (kernels.predict, kernels.update) == (kalman.predict, kalman.update)
-    return known and not algorithm.timing.pooled
+    return (kernels is None or kernels.is_kalman) and not algorithm.timing.pooled
 
 
 def _check_owners(scenario: DerivedScenario, name: str, entries: Sequence[Any]) -> None:
@@ -347,7 +346,7 @@ def _check_quantisation(scenario: DerivedScenario) -> None:
         return
     algorithm, why = scenario.node_filter, None
     kernels = compiled_kernels(algorithm, not scenario.slotted)
-    if kernels is not None and (kernels.sends_readings or kernels.shift_payload is kalman.absorb):
+    if kernels is not None and (kernels.sends_readings or kernels.shift_payload is nothing):
         why = f"cannot be with the {filter_name(scenario)}, whose messages have readings or bits"
     elif scenario.plant.linear and scenario.knows_input:
         why = "cannot stand beside an input of a linear plant that filters know"

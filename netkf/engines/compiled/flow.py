@@ -30,7 +30,7 @@ from netkf.engines.compiled.events import (
     WANT_TICKS,
 )
 from netkf.engines.compiled.lane_series import series_of_lanes
-from netkf.engines.compiled.life_tables import life_table, remove_samples
+from netkf.engines.compiled.life_tables import LifeTable, life_table, remove_samples
 from netkf.engines.compiled.pair_exchange import pair_exchange
 from netkf.engines.compiled.quantiser import PayloadQuantiser, dither_of
 from netkf.engines.compiled.sample_tables import samples_of
@@ -232,7 +232,6 @@ class Workspace:
             nodes["offset"][place], nodes["pace"][place] = clock.offset, clock.pace
         n = start.xhat.shape[1]
         xhat, root = self._begin_estimates(instants, together)
-        lives, waking = draws.lives, self._begin_reading(nodes["down"])
         state: Simulation = (Simulation.of_size(n) if self._unrolled else Simulation)(
             size=sized(n) if self._unrolled else np.zeros(n),
             plant=sized(n) if self._unrolled else np.zeros(self._scenario.plant.n),
@@ -256,8 +255,8 @@ class Workspace:
             ticks_stop=len(window.t),
             # Plants that change have no frames.
             frames=draws.states.frame_times if not len(changes) else changes,
-            lives=lives.t,
-            waking=np.where(np.isin(lives.node, waking), lives.node, -1),
+            lives=draws.lives.t,
+            waking=self._begin_reading(draws.lives),
             quantiser=self._quantiser.with_streams(draws.dither),
             probes=self._probes,
             buffer=self._buffer if buffer is None else buffer,
@@ -272,15 +271,13 @@ class Workspace:
         )
         return state
 
-    def _begin_reading(self, down: IntArray) -> list[int]:
-        """Return the nodes (indices) that read increments while they are up, after those that are
-        ``down`` (N,) have stopped.
-        """
+    def _begin_reading(self, lives: LifeTable) -> IntArray:
+        """Let nodes that are down at first read no increments; return ``Simulation.waking``."""
         waking = [self._scenario.topology.index[node] for node in self._scenario.waking_nodes]
         for h in waking:
             assert self.clocked is not None
-            self.clocked.set_reading(h, not down[h])
-        return waking
+            self.clocked.set_reading(h, not lives.down[h])
+        return np.where(np.isin(lives.node, waking), lives.node, -1)
 
     def _scalar_fields(self, instants: Instants) -> dict[str, Any]:
         algorithm = self._scenario.node_filter

@@ -392,7 +392,7 @@ class ClockedNode(Node):
     ) -> None:
         super().__init__(*arguments)
         self._timeline, self._recorder, self._truth = timeline, recorder, truth
-        self._increments, self._clock, self._reads = increments, clock, True
+        self._increments, self._clock = increments, clock
         # The time in seconds by its clock, to which the filter is predicted.
         self._now = clock.shows(0.0)
         # The samples of the present instant, until the update that uses all of them.
@@ -414,7 +414,6 @@ class ClockedNode(Node):
         """
         if self._increments and self.node >= 0:
             self.predict_to(time)
-            self._reads = up
             self.moving_model.set_reading(up)
 
     def predict_to(self, time: float) -> None:
@@ -434,7 +433,7 @@ class ClockedNode(Node):
         min_interval = MIN_GAP_SHARE * (time - self._now)
         while self._now < time:
             end = time
-            interval = self._interval(self.state) if self._reads else math.inf
+            interval = self._interval(self.state) if self.moving_model.reads else math.inf
             if interval < time - self._now:
                 # P changes too much over the whole gap: use the increments of a part of it.
                 end = interval_end(self._now, time, max(interval, min_interval))
@@ -444,7 +443,7 @@ class ClockedNode(Node):
             self._predict(self._now, gap)
             moments = self._read(self._now, end)
             # The two moments of the increments, with the gains for a gap of this length.
-            if self._reads:
+            if self.moving_model.reads:
                 self.state = self.algorithm.update(self.state, Increments(moments, gap))
             self._now = end
 

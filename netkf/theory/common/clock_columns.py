@@ -119,6 +119,7 @@ class ClockColumns(LoggedColumns):
         if piece < len(self._scenario.model_pieces):
             self._filters.clocked.begin_piece(piece)
         self._lay_laws(piece)
+        self._flows_of_all = increment_flows(self._scenario, self.estimators, piece)
         self._begin_flows()
 
     def _begin_flows(self) -> None:
@@ -126,9 +127,9 @@ class ClockColumns(LoggedColumns):
         for node in self._scenario.waking_nodes:
             h = self._index[node]
             self._filters.clocked.set_reading(h, h not in self._silent)
-        self._flows: IncrementFlows | None = increment_flows(
-            self._scenario, self.estimators, self._piece, self._silent
-        )
+        self._flows: IncrementFlows | None = self._flows_of_all
+        if self._silent and self._flows is not None:
+            self._flows = self._flows.without(self._silent)
 
     def _change_life(self, node: int, time: float) -> None:
         """Let the continuous sensors of a node (id) fall silent at ``time`` (s), or read again."""

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import compiled_kernels
-from netkf.algorithms.kernels import run as standard
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, IntArray, square_root
 from netkf.scenario.scenario import Scenario
@@ -45,6 +44,15 @@ class IncrementFlows(NamedTuple):
     def unit(self) -> float:
         """The time (seconds) over which series and quadrature of all flows hold."""
         return min(flow.unit for flow, _ in self.groups)
+
+    def without(self, silent: Collection[int]) -> IncrementFlows | None:
+        """Return the flows of all estimators but those that are ``silent`` (indices), None if all
+        are.
+        """
+        kept = [(flow, members[~np.isin(members, list(silent))]) for flow, members in self.groups]
+        groups = [(flow, members) for flow, members in kept if len(members)]
+        reading = [h for _, members in groups for h in members.tolist()]
+        return self._replace(groups=groups, reading=reading) if groups else None
 
     def advance(
         self,
@@ -113,19 +121,13 @@ def integration_steps(scenario: Scenario) -> int:
     return math.ceil(scenario.horizon / min(units)) if units else 0
 
 
-def increment_flows(
-    scenario: Scenario, estimators: int, piece: int = 0, silent: Collection[int] = ()
-) -> IncrementFlows | None:
-    """Return how errors with increments evolve in a ``piece`` of the plant, of estimators but those
-    that are ``silent`` (indices); None without any.
-    """
+def increment_flows(scenario: Scenario, estimators: int, piece: int = 0) -> IncrementFlows | None:
+    """Return how errors with increments evolve in a ``piece`` of the plant; None without any."""
     observations = increment_observations(scenario)
-    for h in silent:
-        observations[h] = observations[h]._replace(H=observations[h].H[:0])
     if not any(len(observation.H) for observation in observations):
         return None
     kernels = compiled_kernels(scenario.node_filter, clocked=True)
-    if kernels and (kernels.predict, kernels.update) != (standard.predict, standard.update):
+    if kernels and not kernels.is_kalman:
         raise TheoryError("the exact errors of this filter are known for sampled sensors")
     believed, true = scenario.believed_pieces, scenario.diffusion.pieces[piece]
     A, Q = believed[min(piece, len(believed) - 1)]

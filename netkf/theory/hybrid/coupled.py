@@ -128,9 +128,10 @@ def reason_without_bound(scenario: Scenario) -> str | None:
     if network.channel.delay.fixed is None:
         return "not promised: Tanwani's H(12) holds for no or fixed delays, and the delay is random"
     dependent = "not promised: losses depend on earlier ones, so arrivals are not Poisson processes"
-    if lacks_channel_law(scenario):
+    lacks_law = lacks_channel_law(scenario)
+    if lacks_law:
         dependent = f"not promised: {no_channel_law(scenario)}"
-    independent = network.channel.independent and not lacks_channel_law(scenario)
+    independent = network.channel.independent and not lacks_law
     return _reason_of_samples(scenario) if independent else dependent
 
 
