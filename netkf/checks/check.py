@@ -70,8 +70,10 @@ from netkf.trace.run import Run
 if TYPE_CHECKING:
     import pandas as pd
 
-MIN_RUNS = 10
-"""Smallest number of runs of a check."""
+MIN_RUNS, USUAL_RUNS = 10, 500
+"""Smallest number of runs of a check, and that of networks of up to MANY_NODES."""
+MANY_NODES, MANY_ERRORS = 100, 20_000
+"""Larger networks take as many runs as have MANY_ERRORS nodes together, if none is given."""
 TWIN_RUNS = 10
 """Replicas of a user's class that are also run with the built-in filter that it derives from."""
 TWIN_TOLERANCE = 1e-6
@@ -357,9 +359,17 @@ def _require_covariances(scenario: Scenario, results: list[ReplicaResult]) -> No
         raise TheoryError("the filter gives no covariance, and promises are about covariances")
 
 
+def usual_runs(scenario: Scenario) -> int:
+    """Return the number of runs of a check that is given none: 500, of more than 100 nodes as many
+    as have 20,000 nodes together, and at least 10.
+    """
+    nodes = len(scenario.nodes)
+    return USUAL_RUNS if nodes <= MANY_NODES else max(MIN_RUNS, MANY_ERRORS // nodes)
+
+
 def check(
     scenario: Scenario,
-    runs: int = 500,
+    runs: int | None = None,
     seed: int | None = None,
     confidence: float = 0.99,
     workers: int | None = None,
@@ -371,7 +381,8 @@ def check(
     most: int = MAX_LOOKED_RUNS,
     earlier: Verdict | None = None,
 ) -> Verdict:
-    """Test all promises about the scenario's filter with ``runs`` replicas.
+    """Test all promises about the scenario's filter with ``runs`` replicas, by default 500; fewer
+    of more than 100 nodes, see ``usual_runs``.
 
     The state is sampled at the times that the promises need, whatever ``probe`` says. A user's
     class is held to the promises of the filter that it derives from. ``workers``, ``executor``,
@@ -386,7 +397,7 @@ def check(
     Raises TheoryError if nothing is promised, ScenarioError for bad arguments.
     """
     require_scenario(scenario, "check")
-    count = require_runs(runs, MIN_RUNS)
+    count = require_runs(usual_runs(scenario) if runs is None else runs, MIN_RUNS)
     confident = number(above=0.0, below=1.0)("confidence", confidence)
     root = scenario.seed if seed is None else integer(low=0)("seed", seed)
     if until not in (None, "decided"):

@@ -24,6 +24,10 @@ def _run(options: argparse.Namespace) -> int:
     # Promises are checked at other times than those of ``probe``, which therefore need not fit the
     # horizon; ``--set`` may have changed it.
     scenario = load_scenario(options, {"probe": [0.0]})
+    if options.runs is None:
+        from netkf.checks.check import usual_runs
+
+        options.runs = usual_runs(scenario)
     with lock_directory(options.out):
         return _check(scenario, options)
 

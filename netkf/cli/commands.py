@@ -353,7 +353,7 @@ COMMANDS = (
         "check",
         "compare simulations with theory, one row per promise",
         (
-            _runs("number of runs", 500),
+            _runs("number of runs (default: 500, fewer of more than 100 nodes)", None),
             _option("--until", UNTIL, choices=["decided"]),
             _option("--most", "runs after which --until ends (default: 20000)", type=parse_count),
             SEED,

@@ -30,7 +30,7 @@ def scenario_files(folder: str | Path = "scenarios") -> list[Path]:
 
 def assert_promises(
     scenario: Scenario | str | Path,
-    runs: int = 500,
+    runs: int | None = None,
     seed: int | None = None,
     confidence: float = 0.99,
     workers: int | None = None,

@@ -6,7 +6,7 @@ import scipy.stats
 
 import netkf
 from netkf.checks import exact, statistics
-from netkf.checks.check import check, judge_replicas, run_replica, with_check_times
+from netkf.checks.check import check, judge_replicas, run_replica, usual_runs, with_check_times
 from netkf.checks.evidence import BROKEN, HOLDS, NOT_PROMISED
 from netkf.core.errors import TheoryError
 from netkf.laws import intervals
@@ -422,3 +422,16 @@ def test_chi_square_is_pearsons():
     pooled = scipy.stats.chisquare([30, 18, 12], [30, 15, 15])  # cells below 5 go to the last one
     assert cells == 3
     assert p == pytest.approx(pooled.pvalue)
+
+
+@pytest.mark.parametrize(
+    ("nodes", "runs"), [(3, 500), (100, 500), (101, 198), (1000, 20), (5000, 10)]
+)
+def test_larger_networks_take_fewer_runs(nodes, runs, tmp_path):
+    network = {**GOSSIP["network"], "graph": {"kind": "cycle", "nodes": nodes}}
+    assert usual_runs(from_table({**GOSSIP, "network": network}, tmp_path)) == runs
+
+
+def test_runs_that_are_not_given_are_the_usual_ones(tmp_path, monkeypatch):
+    monkeypatch.setattr("netkf.checks.check.USUAL_RUNS", 11)
+    assert check(from_table(GOSSIP, tmp_path), workers=1).runs == 11
