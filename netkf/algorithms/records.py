@@ -9,6 +9,7 @@ node at a time, see ``algorithms.kernels.run``.
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -27,6 +28,14 @@ from netkf.linalg.structs import Struct, StructClass
 
 Shapes = Mapping[str, Any]
 """Shape of each array by name; a pair (shape, dtype) where entries are no float64."""
+
+
+FIELDS = ("node", "past", "link", "scratch", "settings")
+"""Tables of a Record whose arrays and numbers are fields of one struct."""
+HELD = ("xhat", "root", "payload", "kept", "room")
+"""Fields that each such struct may have besides."""
+RESERVED = frozenset([*dir(Struct), *Struct.__annotations__, "view"])
+"""What structs, and numba, take for something else."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +69,15 @@ class Record:
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Raise TypeError for what is no shape, by which memory would be shared out."""
+        """Raise TypeError for what is no shape, by which memory would be shared out, and for names
+        that mean something else.
+        """
+        own = Counter(name for table in FIELDS for name in getattr(self, table))
+        for name in (*own, *self.payload):
+            is_taken = name in RESERVED or own[name] > 1 or (name in HELD and name in own)
+            if is_taken or not name.isidentifier():
+                rule = "must be a name that nothing else in a record has"
+                raise TypeError(f"Record: {quote(name)} {rule}; choose another one")
         for table in ("node", "past", "link", "payload", "scratch"):
             for name, shape in getattr(self, table).items():
                 if not _is_shape(shape):

@@ -36,6 +36,7 @@ from netkf.algorithms.models import (
 )
 from netkf.algorithms.python_pairs import PythonPairs
 from netkf.algorithms.records import Kernels, Records, double_past, make_records
+from netkf.core.contracts import ContractError
 from netkf.linalg.addresses import call_kernel
 from netkf.linalg.arrays import FloatArray, IntArray, array_address
 from netkf.linalg.lanes import ONE
@@ -393,6 +394,8 @@ def emit(state: NodeState, exchange: Any) -> tuple[NodeState, Payload | None]:
     payload = cls(**{k: np.zeros((count, *a.shape[1:]), a.dtype) for k, a in former.items()})
     record.payload = payload
     call_kernel(state.kernels.emit, record, 0, 0, run=run)
+    if not (run.sends[0] or state.kernels.decides):
+        raise ContractError("emit writes 0 into run.sends: write Kernels(decides=True)")
     has_reading = new.reading is not None
     silent = exchange.slot >= 0 and not surroundings.sends(exchange.phase, has_reading)
     if silent or not run.sends[0]:

@@ -15,8 +15,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, wraps
 from operator import attrgetter
+from types import FunctionType
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -256,8 +257,16 @@ def forwarding(cls: F) -> F:
     """
     for name in vars(Filter).keys() - vars(cls).keys():
         if not name.startswith("_"):
-            setattr(cls, name, property(attrgetter(f"wrapped.{name}")))
+            setattr(cls, name, _forwarded(name, vars(Filter)[name]))
     return cls
+
+
+def _forwarded(name: str, contract: Any) -> Any:
+    """Return a method, or a property, with what ``wrapped`` has of that name."""
+    find = attrgetter(f"wrapped.{name}")
+    if isinstance(contract, FunctionType):
+        return wraps(contract)(lambda self, *arguments: find(self)(*arguments))
+    return property(find)
 
 
 class WrappedState(NamedTuple):

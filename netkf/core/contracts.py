@@ -190,7 +190,7 @@ def require_known_members(cls: type) -> None:
 def _values_of(contract: type) -> Iterator[tuple[str, str, tuple[str, ...]]]:
     """Yield each value that a class of netkf states, its class, and the names of its fields."""
     stated = {
-        name: str(member.fget.__annotations__.get("return", ""))
+        name: str(getattr(member.fget, "__annotations__", {}).get("return", ""))
         for name, member in vars(contract).items()
         if isinstance(member, property) and member.fget is not None
     }

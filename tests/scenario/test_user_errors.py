@@ -16,7 +16,7 @@ import pytest
 import netkf
 from netkf import parts
 from netkf.cli.main import main
-from netkf.kernels import Kernels, Record
+from netkf.kernels import Kernels, Record, kernel
 from netkf.testing import check_channel, check_clock, check_filter, check_sensor
 
 HEAD = "from dataclasses import dataclass\nimport numpy as np\nfrom netkf.parts import *\n"
@@ -318,7 +318,8 @@ class Rows(parts.Filter):
 
 
 def test_theory_names_the_class_that_it_calls(ring):
-    scenario = ring.replace({"filter": Rows(), "horizon": 2.0})
+    sampling = {"kind": "periodic", "period": 0.5}
+    scenario = ring.replace({"filter": Rows(), "horizon": 2.0, "sensors.0.sampling": sampling})
     run = netkf.simulate(scenario)
     with pytest.raises(
         netkf.EngineError, match=r"Rows failed in absorb: ValueError: operands .*; .*, line"
@@ -370,6 +371,36 @@ def test_what_is_no_record_or_kernel_is_told(what, ring):
             netkf.simulate(ring.replace({"filter": Misshapen(what)}), engine=engine)
     with pytest.raises(TypeError, match=r"Kernels\.absorb must be a kernel .*, not 3"):
         Kernels(absorb=3)
+
+
+@pytest.mark.parametrize(
+    "tables",
+    [
+        {"node": {"memory": ()}},
+        {"link": {"view": ()}},
+        {"payload": {"two words": ()}},
+        {"settings": {"xhat": 1.0}},
+        {"node": {"a": ()}, "scratch": {"a": ()}},
+    ],
+)
+def test_names_that_mean_something_else_in_a_record_are_refused(tables):
+    with pytest.raises(TypeError, match=r"Record: \S.* must be a name that nothing else in a r"):
+        Record(**tables)
+
+
+@kernel
+def mute(record, h, m, run):
+    run.sends[0] = 0
+
+
+class Mute(parts.Filter):
+    kernels = Kernels(emit=mute)
+
+
+def test_a_kernel_that_is_silent_without_saying_so_is_told():
+    """SimPy sent nothing, and the compiled engine did not ask."""
+    with pytest.raises(AssertionError, match=r"run.sends: write Kernels\(decides=True\)"):
+        check_filter(Mute())
 
 
 @pytest.mark.parametrize("engine", ["simpy", "compiled"])

@@ -6,6 +6,7 @@ import pytest
 
 from netkf import parts
 from netkf.algorithms.filter import commutes
+from netkf.core.contracts import require_known_members
 from netkf.testing import check_filter
 from tests.conftest import with_slow
 from tests.testing.broken_filters import BROKEN
@@ -74,6 +75,12 @@ def test_every_kind_of_filter_is_here():
     for name, examples in SOUND.items():
         for part in examples:
             assert type(part) is KINDS["filter"][name]
+
+
+@pytest.mark.parametrize("name", KINDS["filter"])
+def test_a_class_derived_from_any_filter_of_ours_is_sound(name):
+    """One that derives from the stochastic trigger ended in an AttributeError."""
+    require_known_members(type("Same", (KINDS["filter"][name],), {"__module__": __name__}))
 
 
 LONG = (

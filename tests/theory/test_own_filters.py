@@ -1,10 +1,15 @@
 """A user's filter in kernels has exact errors under clocks, without an equation of its own."""
 
+from dataclasses import dataclass
+
 import numpy as np
+import pytest
 import scipy.linalg
 
 import netkf
 from netkf import theory
+from netkf.kernels import Kernels, Record
+from netkf.parts import Analysis, Filter
 from netkf.scenario.reading import from_table
 from netkf.theory.errors import error_law
 from netkf.trace.schema import CODES
@@ -194,3 +199,38 @@ def test_a_filter_in_kernels_has_exact_errors(tmp_path):
         stacked = theory.error_covariance(scenario, run, stacked=True)
         joint = covariance.reshape(3, 2 * N, 3, 2 * N)
         np.testing.assert_allclose(stacked, np.einsum("kakb->kab", joint), rtol=1e-9, atol=1e-9)
+
+
+@dataclass(frozen=True, eq=False)
+class Sharing(Filter):
+    """Averages estimates, in plain Python."""
+
+    analysis = Analysis(affine=True)
+
+    def absorb(self, state, messages, exchange):
+        mean = state.xhat
+        for message in messages:
+            mean = mean + message.weight * (message.payload.xhat - state.xhat)
+        return state._replace(xhat=mean)
+
+    def shift(self, state, offset):
+        return state._replace(xhat=state.xhat + offset)
+
+
+@dataclass(frozen=True, eq=False)
+class Flagging(Filter):
+    kernels = Kernels(
+        lambda *_: Record(node={"flag": ((), np.uint8)}, payload={"xhat": (2,), "root": (2, 2)})
+    )
+    shift = Filter.shift
+
+
+def test_what_is_not_known_of_own_verbs_is_said(ring):
+    """Verbs in Python were not given the increments, and errors were four times too large."""
+    for filtering, words in (
+        (Sharing(), "known for sampled sensors"),
+        (Flagging(), "need records of int64 and float64, and flag is uint8"),
+    ):
+        scenario = ring.replace({"horizon": 1.0, "filter": filtering})
+        with pytest.raises(netkf.TheoryError, match=words):
+            theory.error_covariance(scenario, netkf.simulate(scenario, engine="simpy"))

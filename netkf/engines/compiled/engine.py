@@ -16,6 +16,7 @@ from netkf.engines.base import Engine, Progress
 from netkf.engines.compiled.batches import flow_batches, quick_runs
 from netkf.engines.compiled.flow import FlowRun, Source, Workspace
 from netkf.engines.compiled.gates import ungated_readings
+from netkf.engines.compiled.outcomes import unknown_outcomes
 from netkf.engines.compiled.own_sensors import is_own, reads_in_python
 from netkf.engines.compiled.quantiser import unquantised_messages
 from netkf.engines.compiled.slot_pairs import blocks_refusal
@@ -79,6 +80,8 @@ class CompiledEngine(Engine):
             rule = unquantised
         elif (ungated := ungated_readings(scenario)) is not None:
             rule = f"a gate on {ungated}"
+        elif (outcomes := unknown_outcomes(scenario)) is not None:
+            rule = outcomes
         if rule:
             return f'engine "compiled" cannot run {rule}; {remedy}'
         if compiled_kernels(scenario.node_filter, not scenario.slotted) is None:

@@ -13,6 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from netkf.algorithms.filter import compiled_kernels
+from netkf.algorithms.running_sums import KERNELS as PUSH_SUM
 from netkf.engines.compiled.moving_links import MovingLinks
 from netkf.engines.compiled.senders import Senders
 from netkf.linalg.arrays import FloatArray, IntArray
@@ -47,9 +49,11 @@ from netkf.network.losses import (
     PerLink,
     Transmission,
     demand_probability,
+    identical_per_link,
     law_in_kernels,
 )
 from netkf.network.radio import Airtime
+from netkf.network.scheduled import ScheduledLoss
 from netkf.rng.draws import Ziggurat, next_exponential, next_unit, ziggurat
 from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
 from netkf.rng.streams import WIDTH, ReplicaStreams, Streams
@@ -344,6 +348,20 @@ def message_delays(
         )
         delay[k] = checked_delays(channel.delay, arriving, delay[k])
     return np.where(lost, LOST, delay)
+
+
+def unknown_outcomes(scenario: Scenario) -> str | None:
+    """Return which outcomes ticks alone do not tell, since nodes may be silent at them; or None."""
+    kernels = None if scenario.slotted else compiled_kernels(scenario.node_filter, clocked=True)
+    # A node of push-sum is silent only where nobody hears it.
+    if kernels is None or not kernels.decides or kernels is PUSH_SUM:
+        return None
+    channel = scenario.network.channel
+    follows_time = type(channel.loss) in (GilbertElliott, ScheduledLoss)
+    is_known = follows_time or identical_per_link(channel.loss)
+    if is_known and not (channel.channels or delay_depends_on_message(channel.delay)):
+        return "a radio where nodes may be silent at a tick" if scenario.messages_queue else None
+    return "outcomes by the number of a message where nodes may be silent at a tick"
 
 
 def draws_in_kernels(network: Network) -> bool:

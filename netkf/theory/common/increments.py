@@ -20,6 +20,8 @@ from netkf.theory.common.forms import MEAN, Forms
 from netkf.theory.common.observations import increment_observations
 from netkf.theory.numerics.prediction import NODES, WEIGHTS, ErrorFlow, StateFlow
 
+KNOWN_OF_SAMPLES = "the exact errors of this filter are known for sampled sensors"
+
 
 class IncrementFlows(NamedTuple):
     """Flows of errors in a run with increment sensors.
@@ -128,7 +130,7 @@ def increment_flows(scenario: Scenario, estimators: int, piece: int = 0) -> Incr
         return None
     kernels = compiled_kernels(scenario.node_filter, clocked=True)
     if kernels and not kernels.is_kalman:
-        raise TheoryError("the exact errors of this filter are known for sampled sensors")
+        raise TheoryError(KNOWN_OF_SAMPLES)
     believed, true = scenario.believed_pieces, scenario.diffusion.pieces[piece]
     A, Q = believed[min(piece, len(believed) - 1)]
     plant = true.A, true.B

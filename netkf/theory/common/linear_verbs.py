@@ -86,8 +86,10 @@ class LinearVerbs:
         payload = self._template.payload
         for name in type(payload).struct_fields:
             arrays[PAYLOAD + name] = getattr(payload, name)
-        if any(array.dtype.itemsize != 8 for array in arrays.values()):
-            raise TheoryError("exact errors need records of int64 and float64")
+        for name, array in arrays.items():
+            if array.dtype.itemsize != 8:
+                rule = "exact errors need records of int64 and float64"
+                raise TheoryError(f"{rule}, and {name} is {array.dtype}; declare it as one of them")
         self._lay_out(arrays, {})
         self._start = {name: array.copy() for name, array in arrays.items()}
         self._start_means = {
