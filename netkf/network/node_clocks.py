@@ -104,7 +104,7 @@ class NodeTime(NamedTuple):
         """
         shown = self.grid.snap(ticks + (ahead + self.offset))
         times = self.grid.snap((shown - self.offset) / self.pace)
-        return times[times > 0.0] if ahead < 0.0 else times
+        return np.asarray(times[times > 0.0])
 
 
 def node_time(scenario: Any, streams: Any, node: int) -> NodeTime:

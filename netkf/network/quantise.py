@@ -128,9 +128,7 @@ class Encoder:
             sent = np.tri(len(values), dtype=bool).T
         received = values.copy()
         received[sent], count = self._quantisation.apply(values[sent], self._random)
-        # A diagonal matrix is triangular.
-        is_full = is_symmetric and np.triu(values, 1).any()
-        return np.where(sent, received, received.T) if is_full else received, count
+        return np.where(sent, received, received.T) if is_symmetric else received, count
 
 
 def encoders(scenario: Any, streams: Any) -> dict[int, Encoder]:

@@ -64,9 +64,9 @@ class Airtime:
     def __init__(self, scenario: Any, streams: Any) -> None:
         self.radio: Radio = scenario.network.radio
         self._instant = scenario.time_grid.instant
-        # Of nodes that have lives, whether they are up at first, and when that changes.
-        self._lives = {
-            node: (life.up, [*(change.time for change in life.changes), math.inf])
+        # When nodes go up and down; one that is down sends nothing.
+        self._changes = {
+            node: [*(change.time for change in life.changes), math.inf]
             for node, life in lifetimes(scenario, streams).items()
         }
         self._free: dict[int, float] = {}
@@ -81,14 +81,14 @@ class Airtime:
         """Return when the last bit of ``size`` bytes of ``sender`` is sent; nan if it never is."""
         if sender not in self._end:
             free = self._free.get(sender, 0.0)
-            is_up, changes = self._lives.get(sender, (True, [math.inf]))
-            passed = bisect_right(changes, now)
-            if (passed % 2 == 1) == is_up or (free > now and self.radio.queue == "drop"):
+            changes = self._changes.get(sender, [math.inf])
+            down = changes[bisect_right(changes, now)]
+            if free > now and self.radio.queue == "drop":
                 self._end[sender] = math.nan
             else:
                 end = self._instant(max(now, free) + self.radio.seconds(size))
-                self._free[sender] = min(end, changes[passed])
-                self._end[sender] = math.nan if end > changes[passed] else end
+                self._free[sender] = min(end, down)
+                self._end[sender] = math.nan if end > down else end
         return self._end[sender]
 
     def waits(self, sender: int, sizes: Iterable[float], times: FloatArray) -> FloatArray:

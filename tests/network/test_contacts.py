@@ -90,7 +90,7 @@ def test_links_tick_as_their_clock_inside_and_never_outside(name, make):
     [
         Poisson(rate=3.0),
         Renewal(distribution="constant", mean=0.3),
-        Periodic(period=0.25),
+        Periodic(period=0.1),
         Periodic(period=0.25, phase=0.1, jitter=0.2),
     ],
     ids=lambda clock: repr(type(clock).__name__),
@@ -197,6 +197,21 @@ def test_a_contact_of_an_instant_has_the_tick_of_that_instant(make, tmp_path):
     (tmp_path / "contacts.csv").write_text("from,until,node,peer\n8,8,0,1\n9.1,9.1,0,1\n")
     _, contacts = make(CLOCKS["periodic"])
     assert ticks_of(netkf.simulate(contacts), (0, 1)) == [8.0]
+
+
+def test_contacts_that_overlap_are_one_and_those_that_touch_do_not_overlap(make, tmp_path):
+    rows = "from,until,node,peer\n0,10,0,1\n1,2,0,1\n5,6,0,1\n10,12,0,1\n"
+    (tmp_path / "contacts.csv").write_text(rows)
+    _, contacts = make(CLOCKS["periodic"])
+    assert ticks_of(netkf.simulate(contacts), (0, 1)) == [0.5 * k for k in range(1, 25)]
+    assert any("2 of 4 rows overlap" in note for note in contacts.notes)
+
+
+def test_times_in_contact_and_distances_from_contacts_are_counted_by_hand(make, tmp_path):
+    (tmp_path / "contacts.csv").write_text("from,until,node,peer\n-3,2,0,1\n6,8,0,1\n")
+    clock = make(CLOCKS["periodic"])[1].network.activation
+    assert clock.time_in_contact((0, 1), np.array([1.0, 4.0, 7.0])).tolist() == [1.0, 2.0, 3.0]
+    assert clock.distance((0, 1), np.array([1.0, 4.5, 9.0])) == 1.5
 
 
 WRONG = {

@@ -634,6 +634,26 @@ def test_a_node_that_goes_up_after_the_run_is_down_in_it(scenario_of, life, memo
     assert len(prints) == 1
 
 
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_a_node_ticks_at_the_instant_at_which_it_goes_up(scenario_of, engine):
+    # In floats 3 times 0.1 is later than 0.3.
+    life = '[[network.lives]]\nnodes = [1]\nkind = "duty"\nperiod = 0.1\nup = 0.05'
+    clock = {"kind": "periodic", "period": 0.1, "at": "nodes"}
+    scenario = scenario_of(CLOCKS, life, filter_="hybrid").replace({"network.activation": clock})
+    events = netkf.simulate(scenario, seed=2, engine=engine).events
+    assert ((events["kind"] == "tick") & (events["node"] == 1)).sum() == 99
+
+
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_a_node_that_is_down_when_the_next_slot_begins_does_not_begin_again(scenario_of, engine):
+    life = '[[network.lives]]\nnodes = [1]\nkind = "recorded"\npath = "l.csv"\nmemory = "lost"'
+    rows = "t,node,what\n0.2,1,down\n0.3,1,up\n1,1,down\n2.5,1,up\n"
+    events = netkf.simulate(scenario_of(SLOTS, life, {"l.csv": rows}), engine=engine).events
+    own = events[(events["node"] == 1) & (events["t"] < 4.0)]
+    kinds = list(zip(own["t"], own["kind"], strict=True))
+    assert [k for k in kinds if k[1] != "sense"] == [(0.2, "crash"), (3.0, "restart")]
+
+
 def test_the_row_that_says_how_a_node_begins_is_used(scenario_of):
     life = '[[network.lives]]\nnodes = [1, 2]\nkind = "recorded"\npath = "l.csv"'
     rows = "t,node,what\n10,1,join\n20,1,leave\n-2,2,up\n-1,2,down\n20,2,up\n"

@@ -1,6 +1,7 @@
 """Clocks of nodes that are wrong: ticks, stamps, and what filters make of them."""
 
 import bisect
+import itertools
 
 import numpy as np
 import pytest
@@ -152,6 +153,34 @@ def test_ticks_and_samples_are_at_local_times(scenario_of):
         for node in range(3):
             expected = local_lattice(node, period, 6.0)
             np.testing.assert_allclose(rows["t"][rows["node"] == node], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_rows_of_tables_are_of_local_times(scenario_of, tmp_path, engine):
+    local = (0.1, 1.0, 2.5)
+    rows = "".join(f"{t},{node}\n" for t in local for node in range(3))
+    (tmp_path / "rows.csv").write_text("t,node\n" + rows)
+    table = {"kind": "recorded", "path": "rows.csv"}
+    changes = {"network.activation": {**table, "at": "nodes"}, "sensors.0.sampling": table}
+    log = netkf.simulate(scenario_of().replace(changes), engine=engine).log
+    for node, kind in itertools.product(range(3), ("sense", "tick")):
+        t = log["t"][(log["kind"] == CODES[kind]) & (log["node"] == node)]
+        # What the clock shows at the start has passed.
+        shown = np.array([one for one in local if one > OFFSET[node]])
+        np.testing.assert_allclose(t, (shown - OFFSET[node]) / (1.0 + DRIFT[node]), atol=1e-12)
+
+
+def test_contacts_are_of_no_clock_of_a_node(scenario_of, tmp_path):
+    (tmp_path / "contacts.csv").write_text("from,until,node,peer\n1,3,0,1\n2,5,1,0\n")
+    contacts = {"kind": "contacts", "path": "contacts.csv", "at": "directions"}
+    activation = {**contacts, "clock": {"kind": "periodic", "period": 0.3}}
+    for clocks in ("", CLOCKS):
+        scenario = scenario_of(clocks, at="directions").replace({"network.activation": activation})
+        for engine in ("simpy", "compiled"):
+            log = netkf.simulate(scenario, engine=engine).log
+            ticks = log["t"][log["kind"] == CODES["tick"]]
+            assert ticks.tolist() == [1.2, 1.5, 1.8, 2.1, 2.1, 2.4, 2.4, 2.7, 2.7, 3.0, 3.0,
+                                      3.3, 3.6, 3.9, 4.2, 4.5, 4.8]  # fmt: skip
 
 
 @pytest.mark.parametrize("at", ["nodes", "directions", "links"])

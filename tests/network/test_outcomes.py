@@ -12,6 +12,7 @@ import netkf
 from netkf.checks.parts.events import loss_law
 from netkf.checks.parts.network_rows import LOSS_ROW
 from netkf.network.losses import Bernoulli, GilbertElliott, Loss, SharedLoss
+from netkf.scenario.usage import record_usage
 from netkf.trace.schema import CODES
 
 CLOCKS = """
@@ -258,6 +259,20 @@ def test_the_schedule_is_followed(scenario_of):
         assert arrived / sent == pytest.approx(p, abs=4.5 * np.sqrt(p * (1 - p) / sent))
 
 
+def test_a_row_holds_from_its_beginning_to_before_its_end(scenario_of):
+    rows = SCHEDULE + "0,60,2,3,0.4\n-9,0,3,2,0.1\n"
+    scenario = scenario_of(CLOCKS, KINDS["scheduled"][0], {"s.csv": rows})
+    loss, sent = scenario.network.channel.loss, scenario.transmission((0, 1))
+    values = [loss.delivery_probability(sent._replace(time=t)) for t in (0.0, 19.9, 20.0, 40.0)]
+    assert values == [0.25, 0.25, 0.75, 0.5]
+    # Directions that change lose neighbouring messages alike, whatever others do.
+    assert not loss.independent
+    assert np.isnan(scenario.mean_delivery((0, 1)))
+    assert scenario.mean_delivery((2, 1)) == 0.5
+    # The last row ends when the run begins.
+    assert loss.use(30.0).used == 4
+
+
 def test_messages_hop(scenario_of):
     scenario = scenario_of(CLOCKS, *KINDS["hopping"], horizon=400.0)
     run = netkf.simulate(scenario, seed=1)
@@ -267,6 +282,22 @@ def test_messages_hop(scenario_of):
         deviation = np.sqrt(p * (1 - p) / len(arrived))
         assert arrived.mean() == pytest.approx(p, abs=4.5 * deviation + 1e-12)
     assert scenario.mean_delivery((0, 1)) == pytest.approx(0.5)
+
+
+def test_channels_deliver_by_direction(scenario_of):
+    pairs = [(i, j) for i in range(5) for j in range(5) if i != j]
+    rows = "channel,sender,receiver,delivery\n" + "".join(
+        f"{channel},{i},{j},{(channel + i) / 20}\n" for channel in (1, 2) for i, j in pairs
+    )
+    scenario = scenario_of(
+        CLOCKS, 'channels = { hopping = [1, 2], path = "h.csv" }', {"h.csv": rows}
+    )
+    channels = scenario.network.channel.channels
+    assert channels.on_hops((3, 0)).tolist() == [0.2, 0.25]
+    assert channels.on_hops((0, 3)).tolist() == [0.05, 0.1]
+    silent = scenario.replace({"filter": {"kind": "local"}})
+    used = [record_usage(s, None)["network.channel.channels"]["used"] for s in (scenario, silent)]
+    assert used == [40, 0]
 
 
 @pytest.mark.parametrize("slots", [6, 7, 9])

@@ -80,6 +80,7 @@ def test_values_beyond_the_range_are_clipped_and_counted():
     )
     assert clipped == 3
     np.testing.assert_allclose(received, [-1.0, 0.3, 1.0, 1.0], atol=2.0 / 256.0)
+    assert (abs(received) <= 1.0).all()
 
 
 def test_triangles_stay_triangles_and_symmetric_matrices_symmetric():
@@ -91,6 +92,7 @@ def test_triangles_stay_triangles_and_symmetric_matrices_symmetric():
     assert (lower[np.triu_indices(3, 1)] == 0.0).all()
     assert (lower[np.tril_indices(3)] != root[np.tril_indices(3)]).all()
     assert (upper[np.tril_indices(3, -1)] == 0.0).all()
+    assert (upper[np.triu_indices(3)] != root.T[np.triu_indices(3)]).all()
     assert np.array_equal(both, both.T)
     assert (count, name) == (7, "x")
 

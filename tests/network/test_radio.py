@@ -5,6 +5,7 @@ import pytest
 
 import netkf
 from netkf.engines.compiled.engine import CompiledEngine
+from netkf.network.radio import Radio
 from netkf.trace.schema import CODES
 from tests.conftest import SCENARIOS
 from tests.engines.agreement import assert_agree
@@ -162,6 +163,25 @@ def test_a_radio_is_free_at_the_instant_at_which_a_message_ends(scenario_of, eng
     run = netkf.simulate(scenario.replace({"network.activation": clock}), engine=engine)
     assert run.count("send") == 6 * 399
     assert not run.count("lost")
+
+
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_a_radio_sends_from_the_instant_of_going_up_to_that_of_going_down(
+    scenario_of, tmp_path, engine
+):
+    (tmp_path / "lives.csv").write_text("t,node,what\n0,0,down\n3,0,up\n5.5,0,down\n")
+    changes = {
+        "network.activation": {"kind": "periodic", "period": 1.0, "at": "nodes"},
+        "network.lives": [{"nodes": [0], "kind": "recorded", "path": "lives.csv"}],
+    }
+    scenario = scenario_of("bits_per_second = 256.0", 20.0).replace(changes)
+    log = netkf.simulate(scenario, engine=engine).log
+    heard = log[(log["kind"] == CODES["deliver"]) & (log["node"] == 1)]
+    assert heard["t"].tolist() == [3.5, 4.5, 5.5]
+
+
+def test_frames_are_counted():
+    assert [Radio(frame_bytes=8).frames(size) for size in (0, 1, 8, 9, 16, 17)] == [1, 1, 1, 2, 2, 3]
 
 
 @pytest.mark.parametrize("queue", ["wait", "drop"])
