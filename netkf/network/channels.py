@@ -171,7 +171,7 @@ class Broadcasts:
         several: bool,
         generator: Callable[[str, int], np.random.Generator],
     ) -> None:
-        links = {link[0]: link for link in reversed(topology.directions)}
+        links = {link[0]: link for link in topology.directions}
         self._samplers = {
             sender: BroadcastSampler(channel.loss, link, several, _of_sender(generator, sender))
             for sender, link in links.items()

@@ -180,8 +180,6 @@ class RecordedInput(Input):
     def owned_by(self, node: int) -> Self:
         """Return the input of the block of ``node`` (id)."""
         owned = copy.copy(self)
-        for name in ("exogenous", "_table"):
-            owned.__dict__.pop(name, None)
         object.__setattr__(owned, "node", node)
         return owned
 

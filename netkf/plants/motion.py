@@ -13,8 +13,6 @@ import math
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 
-SMALL = 1e-4
-"""Below this angle sinc is its series up to the fourth power, which is exact there."""
 SERIES = 0.25
 """Below this turn the derivatives with respect to the turn rate are series."""
 TERMS = 7
@@ -22,11 +20,8 @@ TERMS = 7
 
 @kernel
 def sinc(a: float) -> float:
-    """Return ``sin(a) / a``."""
-    if abs(a) < SMALL:
-        square = a * a
-        return 1.0 - square / 6.0 * (1.0 - square / 20.0)
-    return math.sin(a) / a
+    """Return ``sin(a) / a``, 1 at 0; exact to rounding however small a is."""
+    return math.sin(a) / a if a != 0.0 else 1.0
 
 
 @kernel

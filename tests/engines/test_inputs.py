@@ -16,6 +16,7 @@ import netkf
 from netkf.algorithms.traits import Timing
 from netkf.core.errors import NetkfError, TheoryError
 from netkf.parts import Filter, Filtering, Local
+from netkf.rng.streams import Streams
 from netkf.runs.labels import mismatch_note
 from netkf.scenario.reading import from_table
 from netkf.scenario.usage import record_usage
@@ -256,6 +257,19 @@ def test_kcf_replays_recorded_readings_of_a_driven_plant(engine, tmp_path):
         np.testing.assert_allclose(run.P[k], P, rtol=1e-9, atol=1e-9)
     use = record_usage(driven, None)["plant.input"]
     assert (use["rows"], use["unused"]) == (8, 1)  # 3.9 is over in slot 4
+
+
+def test_states_between_the_probes_have_the_response_of_their_instant():
+    u = {"kind": "constant", "G": [[1.0], [0.5]], "value": 2.0}
+    one = scenario(HYBRID, FLOW, ACTIVATIONS["clocks"][1], u)
+    streams = Streams(3, 0)
+    truth, A = one.continuous_truth(streams, frames=False), np.array(FLOW["A"])
+    times = one.sample_times(streams)[0, 0]
+    assert not np.isin(times, one.times).all()
+    for t in times.tolist():
+        # dm = (A m + G u) dt with m(0) = 0.
+        m = np.linalg.solve(A, (scipy.linalg.expm(A * t) - np.eye(2)) @ [2.0, 1.0])
+        np.testing.assert_allclose(truth.absolute(t) - truth.local(t), m, atol=1e-10)
 
 
 @pytest.mark.parametrize("linearise", ["ekf", "ckf"])

@@ -70,6 +70,10 @@ def test_delays_have_their_law(delay, law):
     assert scipy.stats.kstest(seconds, law.cdf).pvalue > 1e-4
     assert scipy.stats.kstest(1.2 * seconds, law.cdf).pvalue < 1e-4
     assert delay.fixed is None
+    assert delay.longest == pytest.approx(law.support()[1])
+    one, other = np.random.default_rng(3), np.random.default_rng(3)
+    together = delays.draw_delays(delay, one, 9)
+    assert together.tolist() == [delay.draw(other) for _ in range(9)]
 
 
 def directions(run):

@@ -293,6 +293,7 @@ def test_channels_deliver_by_direction(scenario_of):
         CLOCKS, 'channels = { hopping = [1, 2], path = "h.csv" }', {"h.csv": rows}
     )
     channels = scenario.network.channel.channels
+    assert not scenario.network.channel.independent
     assert channels.on_hops((3, 0)).tolist() == [0.2, 0.25]
     assert channels.on_hops((0, 3)).tolist() == [0.05, 0.1]
     silent = scenario.replace({"filter": {"kind": "local"}})

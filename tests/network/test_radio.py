@@ -180,6 +180,19 @@ def test_a_radio_sends_from_the_instant_of_going_up_to_that_of_going_down(
     assert heard["t"].tolist() == [3.5, 4.5, 5.5]
 
 
+def test_deliveries_of_several_frames(scenario_of, tmp_path):
+    """Means over states of a link or over channels say nothing of their powers."""
+    frames, mean = "frame_bytes = 8, bytes_per_number = 10", 'kind = "bernoulli", delivery = 0.8'
+    bernoulli = scenario_of(frames, loss=mean)
+    assert bernoulli.mean_delivery((0, 1)) == pytest.approx(0.8**3)
+    bursts = 'kind = "gilbert-elliott", mean_loss = 0.2, mean_burst = 3.0'
+    assert np.isnan(scenario_of(frames, loss=bursts).mean_delivery((0, 1)))
+    (tmp_path / "h.csv").write_text("channel,delivery\n1,0.5\n2,1.0\n")
+    hops = {"network.channel.channels": {"hopping": [1, 2], "path": "h.csv"}}
+    assert np.isnan(bernoulli.replace(hops).mean_delivery((0, 1)))
+    assert scenario_of("", loss=mean).replace(hops).mean_delivery((0, 1)) == pytest.approx(0.6)
+
+
 def test_frames_are_counted():
     assert [Radio(frame_bytes=8).frames(size) for size in (0, 1, 8, 9, 16, 17)] == [1, 1, 1, 2, 2, 3]
 

@@ -278,6 +278,50 @@ def test_range_and_bearing_to_another_node_are_used_as_by_a_plain_ekf(tmp_path: 
         np.testing.assert_allclose(run.P[slot, 0], P, atol=1e-12)
 
 
+def test_couplings_by_name_are_those_of_the_own_node_and_add_up(tmp_path: Path) -> None:
+    drift = """[[plants]]
+name = "drift"
+nodes = [1, 2]
+F = [[0.9]]
+Q = [[0.01]]
+period = 1.0
+cov = [[1.0]]
+coupling = [{ from = "pose", A = [[0.2, 0.0, 0.0]] }, { from = [1], A = [[0.1]] },
+            { from = "pose", A = [[0.05, 0.0, 0.0]] }]
+"""
+    text = PLANAR.replace("[[sensors]]", drift + "[[sensors]]").replace("mean = [0.0", "mean = [0.0, 0.0, 0.0")
+    (tmp_path / "sights.csv").write_text("t,node,to,y0,y1\n1,1,2,5.2,0.7\n")
+    text = text.replace("to = [[1, 2]]\n", 'of = "pose"\n')
+    expected = np.diag([1.0] * 6 + [0.9] * 2)
+    expected[6, 0] = expected[7, 3] = 0.25
+    expected[7, 6] = 0.1
+    np.testing.assert_allclose(load(text, tmp_path).plant.F, expected, rtol=1e-15)
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_each_reader_looks_from_its_own_heading_at_the_other_that_is_named(
+    tmp_path: Path, recorded: bool
+) -> None:
+    pairs = [(2, 1), (2, 3), (3, 1)]
+    table = "t,node,to,y0,y1\n" + "".join(f"1,{i},{j},1,1\n" for i, j in pairs)
+    (tmp_path / "sights.csv").write_text(table)
+    text = PLANAR.replace("[1, 2]\nF", "[1, 2, 3]\nF").replace("[[1, 2]] }", "[[1, 2], [2, 3]] }")
+    text = text.replace("3.0, 4.0, 0.0]", "3.0, 4.0, 0.0, 1.0, 1.0, 0.0]")
+    drawn = text.replace("to = [[1, 2]]", f"to = {[list(pair) for pair in pairs]}")
+    drawn = drawn.replace('path = "sights.csv"\n', "")
+    told = text.replace("to = [[1, 2]]\n", "")
+    x = np.random.default_rng(4).normal(size=9)
+    pose, found = x.reshape(3, 3), []
+    for sensor in load(told if recorded else drawn, tmp_path).sensors:
+        (i,) = sensor.nodes
+        for j in [j for reader, j in pairs if reader == i] if recorded else [pairs[len(found)][1]]:
+            found.append((i, j))
+            dx, dy = pose[j - 1, :2] - pose[i - 1, :2]
+            expected = [math.hypot(dx, dy), math.atan2(dy, dx) - pose[i - 1, 2]]
+            np.testing.assert_allclose(sensor.h(x, j if recorded else i), expected, rtol=1e-12)
+    assert found == pairs
+
+
 def test_heading_of_a_sensor_of_places(tmp_path: Path) -> None:
     sensor = netkf.parts.RangeBearingSensor(
         nodes=(1,), R=np.eye(2), positions=np.array([[2.0, 1.0]]), heading=2
@@ -324,6 +368,12 @@ def test_readings_of_pairs_that_reach_nobody_are_noted(
             "means = [[1.0], [2.0]]\ncov =",
             "plants[0].means",
             "got [[1.0], [2.0]]; correct",
+        ),
+        (
+            "cov =",
+            "mean = [0.0]\nmeans = [[1.0], [2.0], [3.0]]\ncov =",
+            "plants[0].means",
+            "in place of mean",
         ),
         ("A = [[0.0]]", "A = [[0.0]]\nF = [[1.0]]", "plants[0].A", "not a key"),
         ("B = [[0.5]]", "B = [[0.5], [1.0]]", "plants[0].B", "1 x 1"),

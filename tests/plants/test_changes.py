@@ -151,6 +151,10 @@ def test_all_changes_are_multiples_of_the_sensing_period(changes, longest, expec
         ).denominator == 1
 
 
+def test_changes_that_hardly_any_period_divides_leave_it_as_it_is():
+    assert dividing_period(np.array([1.0, 1.0001]), 0.25) == 0.25
+
+
 PLANT = """
 kind = "diffusion"
 A = [[0.0, 1.0], [-0.3, -0.1]]

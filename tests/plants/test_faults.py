@@ -269,6 +269,8 @@ def test_ends_of_the_bad_time_belong_to_it():
     assert y == [0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0]
     assert Drifting(rate=0.5, since=2.0).bias(4.0) == 1.0
     assert Stuck().bias(1.0) is None
+    instant = Biased(size=1.0, since=2.0, until=2.0)
+    assert [instant.holds(t) for t in (1.9, 2.0, 2.1)] == [False, True, False]
 
 
 @pytest.mark.parametrize(

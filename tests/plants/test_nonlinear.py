@@ -166,7 +166,7 @@ def test_what_linear_theory_cannot_promise_is_said(tracking):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"states": [0, 7]}, "sensors[0].states: must be different components of a state of 4"),
+        ({"states": [0, 4]}, "sensors[0].states: must be different components of a state of 4"),
         ({"positions": [[0.0, 0.0]]}, "sensors[0].positions: must be 3 rows of 2"),
         ({"R": [[1.0, 0.0], [0.0, 1.0]]}, "sensors[0].R: must be 1 x 1"),
         ({"kind": "bearing", "states": [0, 1, 2]}, "sensors[0].states: must be 2"),

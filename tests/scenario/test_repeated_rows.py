@@ -243,6 +243,19 @@ def test_rows_before_the_origin_of_a_log_are_counted(changes, key, tmp_path):
         netkf.scenario.reading.from_table(CLOCKS, tmp_path).replace(changes)
 
 
+def test_of_rows_that_hold_those_are_used_that_hold_in_the_run(tmp_path):
+    """At the origin another row begins, and at the horizon too."""
+    base = {**CLOCKS, "time": {"origin": 100}}
+    end = 100 + base["horizon"]
+    rows = "".join(f"{t:g},1\n" for t in (98, 99, 100, 101, end))
+    (tmp_path / "table.csv").write_text("t,u0\n" + rows)
+    u = {"kind": "recorded", "path": "table.csv", "G": [[1.0]]}
+    changes = {"plant.input": u}
+    scenario = netkf.scenario.reading.from_table(base, tmp_path).replace(changes)
+    use = record_usage(scenario, {})["plant.input"]
+    assert (use["used"], use["unused"]) == (2, 3)
+
+
 @pytest.mark.parametrize(
     "changes",
     [
