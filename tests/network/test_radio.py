@@ -194,7 +194,14 @@ def test_deliveries_of_several_frames(scenario_of, tmp_path):
 
 
 def test_frames_are_counted():
-    assert [Radio(frame_bytes=8).frames(size) for size in (0, 1, 8, 9, 16, 17)] == [1, 1, 1, 2, 2, 3]
+    assert [Radio(frame_bytes=8).frames(size) for size in (0, 1, 8, 9, 16, 17)] == [
+        1,
+        1,
+        1,
+        2,
+        2,
+        3,
+    ]
 
 
 @pytest.mark.parametrize("queue", ["wait", "drop"])

@@ -289,7 +289,9 @@ cov = [[1.0]]
 coupling = [{ from = "pose", A = [[0.2, 0.0, 0.0]] }, { from = [1], A = [[0.1]] },
             { from = "pose", A = [[0.05, 0.0, 0.0]] }]
 """
-    text = PLANAR.replace("[[sensors]]", drift + "[[sensors]]").replace("mean = [0.0", "mean = [0.0, 0.0, 0.0")
+    text = PLANAR.replace("[[sensors]]", drift + "[[sensors]]").replace(
+        "mean = [0.0", "mean = [0.0, 0.0, 0.0"
+    )
     (tmp_path / "sights.csv").write_text("t,node,to,y0,y1\n1,1,2,5.2,0.7\n")
     text = text.replace("to = [[1, 2]]\n", 'of = "pose"\n')
     expected = np.diag([1.0] * 6 + [0.9] * 2)
