@@ -342,18 +342,13 @@ def _check_faults(scenario: DerivedScenario) -> None:
 
 
 def _check_quantisation(scenario: DerivedScenario) -> None:
-    if scenario.network.quantise is None:
+    quantise = scenario.network.quantise
+    kernels = compiled_kernels(scenario.node_filter, not scenario.slotted)
+    if quantise is None or kernels is None:
         return
-    algorithm, why = scenario.node_filter, None
-    kernels = compiled_kernels(algorithm, not scenario.slotted)
-    if kernels is not None and (kernels.sends_readings or kernels.shift_payload is nothing):
-        why = f"cannot be with the {filter_name(scenario)}, whose messages have readings or bits"
-    elif scenario.plant.linear and scenario.knows_input:
-        why = "cannot stand beside an input of a linear plant that filters know"
-    elif scenario.views is not None:
-        why = "cannot stand beside nodes that estimate different blocks"
-    if why is not None:
-        raise ScenarioError("network.quantise", why, scenario.network.quantise.bits, "remove it")
+    if kernels.sends_readings or kernels.shift_payload is nothing:
+        rule = f"cannot be with the {filter_name(scenario)}, whose messages have readings or bits"
+        raise ScenarioError("network.quantise", rule, quantise.bits, "remove it")
 
 
 def _check_network(scenario: DerivedScenario) -> None:

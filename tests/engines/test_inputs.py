@@ -399,6 +399,24 @@ def test_a_filter_that_does_not_move_is_told_by_its_model(plant, model):
         np.testing.assert_allclose(getattr(plain, name), getattr(moved, name), atol=1e-9)
 
 
+@pytest.mark.parametrize("plant", ["slots", "samples"])
+def test_numbers_of_few_bits_are_those_of_absolute_states(plant):
+    """One filter is counted from the response to the input, the other is told of it."""
+    if plant == "slots":
+        driven = scenario(ALL["kcf"], LINEAR, {"kind": "broadcast"})
+    else:
+        driven = scenario(HYBRID, FLOW, {"kind": "poisson", "rate": 2.0})
+    few = {"bits": 5, "range": 2.0}
+    plain, moved = (
+        netkf.simulate(driven.replace({"filter": Filtering(cls()), "network.quantise": few}))
+        for cls in (Plain, Shifted)
+    )
+    assert plain.events.equals(moved.events)
+    assert (plain.events["kind"] == "clip").any()
+    for name in ("x", "xhat", "error", "P"):
+        np.testing.assert_allclose(getattr(plain, name), getattr(moved, name), atol=1e-9)
+
+
 def test_filters_that_cannot_be_told_are_refused():
     with pytest.raises(NetkfError, match="must define shift") as refusal:
         scenario({"kind": "local"}, LINEAR, None).replace({"filter": Louder()})

@@ -16,6 +16,7 @@ from netkf.runs.summary import PromisedTraces, SummarySink, summarise
 from netkf.scenario.reading import from_table
 from netkf.trace.recorder import Recorder
 from netkf.trace.schema import CODES
+from tests.conftest import SCENARIOS
 
 SLOTS = """
 format = 1
@@ -108,15 +109,16 @@ def test_nothing_is_received_as_nothing(scenario_of):
     np.testing.assert_allclose(netkf.simulate(scenario).P, netkf.simulate(plain).P, rtol=1e-4)
 
 
-def plain_run(slots, bits, limit, seed):
-    """Estimates (T, 3) of the filter with a constant gain whose nodes hear quantised estimates;
-    the state is 2 0.9^k, without noise.
+def plain_run(slots, bits, limit, seed, drive=0.0):
+    """Estimates (T, 3) of the filter with a constant gain whose nodes hear quantised estimates; the
+    state is z <- 0.9 z + drive from z = 2, without noise.
     """
+    z = 2.0
     draws = [Streams(seed).generator("dither", i) for i in range(3)]
     step, x, found = 2.0 * limit / 2.0**bits, np.full(3, 0.5), [np.full(3, 0.5)]
-    for k in range(1, slots):
-        x = 0.9 * x
-        x = x + L * (2.0 * 0.9**k - x)
+    for _ in range(1, slots):
+        x, z = 0.9 * x + drive, 0.9 * z + drive
+        x = x + L * (z - x)
         told = np.zeros(3)
         for i in range(3):
             # An estimate, and the root of its covariance: two numbers a message.
@@ -134,6 +136,42 @@ def plain_run(slots, bits, limit, seed):
 def test_hearers_use_what_is_received_all_the_same(scenario_of):
     run = netkf.simulate(scenario_of(Q=0.0, R=1e-24), seed=5)
     np.testing.assert_allclose(run.xhat[:, :, 0], plain_run(31, 3, 8.0, 5), rtol=1e-9, atol=1e-9)
+
+
+def test_numbers_are_those_of_absolute_states_beside_an_input(scenario_of):
+    driven = scenario_of(Q=0.0, R=1e-24).replace(
+        {"plant.input": {"kind": "constant", "G": [[1.0]], "value": [0.7]}}
+    )
+    run = netkf.simulate(driven, seed=5)
+    np.testing.assert_allclose(run.xhat[:, :, 0], plain_run(31, 3, 8.0, 5, 0.7), atol=1e-9)
+
+
+def test_a_predictor_swaps_numbers_of_absolute_states(tmp_path):
+    """Readings say nothing: each node predicts what the other one told it of the same slot."""
+    constant = {"kind": "constant", "G": [[1.0]], "value": [0.7]}
+    plant = {"kind": "linear", "period": 1.0, "F": [[0.9]], "Q": [[0.0]], "cov": [[0.0]]}
+    table = {
+        "format": 1,
+        "name": "swaps",
+        "horizon": 30.0,
+        "probe": 1.0,
+        "plant": plant | {"input": constant},
+        "sensors": [{"nodes": [0], "H": [[1.0]], "R": [[1e24]]}],
+        "network": {
+            "graph": {"kind": "path", "nodes": 2},
+            "activation": {"kind": "matching", "protocol": "one-edge"},
+            "quantise": {"bits": 4, "range": 8.0},
+        },
+        "filter": {"kind": "gossip", "mean": [[0.5], [3.0]], "cov": [[1.0]]},
+    }
+    run = netkf.simulate(from_table(table, tmp_path), seed=5)
+    draws = [Streams(5).generator("dither", i) for i in range(2)]
+    x = 0.9 * np.array([0.5, 3.0]) + 0.7  # no swap in slot 0
+    for k in range(1, 30):
+        u = np.array([random.random(2)[0] for random in draws]) - 0.5
+        told = np.clip(np.floor(x + u + 8.0), 0.0, 15.0) + 0.5 - 8.0 - u
+        x = 0.9 * told[::-1] + 0.7
+        np.testing.assert_allclose(run.xhat[k + 1, :, 0], x, atol=1e-9)
 
 
 def plain_intersection(slots, bits, limit, seed):
@@ -340,6 +378,20 @@ def test_nothing_is_promised_and_it_is_said_why(scenario_of):
     with pytest.raises(netkf.TheoryError, match=r"variance 0\.3333"):
         netkf.theory.error_covariance(scenario, netkf.simulate(scenario, seed=1))
     assert find_checks(scenario) is WITHOUT_PAPER
+
+
+def test_nodes_that_estimate_different_blocks_quantise_alike_in_both_engines():
+    areas = netkf.load(SCENARIOS / "blocks" / "ieee14_areas.toml").replace({"horizon": 6.0})
+    few = areas.replace({"network.quantise": {"bits": 6, "range": 0.1}})
+    one, other = (netkf.simulate(few, engine=name) for name in ("simpy", "compiled"))
+    assert one.count("clip") > 0
+    assert one.fingerprint == other.fingerprint
+    np.testing.assert_allclose(one.xhat, other.xhat, atol=1e-10)
+    np.testing.assert_allclose(one.P, other.P, atol=1e-10)
+    fine = netkf.simulate(areas.replace({"network.quantise": {"bits": 48, "range": 100.0}}))
+    exact = netkf.simulate(areas)
+    np.testing.assert_allclose(fine.xhat, exact.xhat, atol=1e-9)
+    np.testing.assert_allclose(fine.P, exact.P, atol=1e-9)
 
 
 @pytest.mark.parametrize(

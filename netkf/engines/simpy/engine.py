@@ -118,6 +118,7 @@ class _Simulation:
             return ClockedNode(*common, *_identify(scenario, node, entity))
 
         nodes = _nodes(scenario, make_node)
+        self._begin_origins(nodes)
         # The conserved sums at the start, before any exchange.
         sums = _Sums(distinct(nodes))
         shared = (scenario, streams, timeline, self._recorder)
@@ -133,6 +134,17 @@ class _Simulation:
     def _begin_reach(self, truth: Any) -> None:
         if self._scenario.links_move:
             self._transmitter.reach = Reach(self._scenario, truth, self._append)
+
+    def _begin_origins(self, nodes: dict[int, Any]) -> None:
+        scenario, responses = self._scenario, self._scenario.input_responses
+        if responses is None or (believed := responses.believed) is None:
+            return
+
+        def origin_of(sender: int) -> FloatArray:
+            states = believed.states(np.array([nodes[sender].estimates_at]))[0]
+            return np.asarray(states[scenario.view(scenario.topology.index[sender])])
+
+        self._transmitter.origin_of = origin_of
 
     def _append(self, row: Any) -> None:
         # A recorder that pauses has another ``append``.
@@ -177,6 +189,7 @@ class _Simulation:
             return SlotNode(recorder, schedule, period, streams, *own)
 
         nodes = _nodes(scenario, make)
+        self._begin_origins(nodes)
         # Filters, readers and the clock are processes that meet by time and rank only.
         processes = [node.run_process(self.timeline) for node in distinct(nodes)]
         processes += self._membership.processes(self.timeline, nodes)

@@ -493,6 +493,11 @@ class ClockedNode(Node):
         if self.after_sample is not None:
             self.after_sample(time)
 
+    @property
+    def estimates_at(self) -> float:
+        """The time in seconds, by its clock, that the estimate is of."""
+        return self._now
+
     def emit(self, time: float, receivers: tuple[int, ...]) -> Any:
         """Return the payload that the node sends to ``receivers`` (ids) at ``time``, or None."""
         # The payload is of the present state, not of that at the last event.

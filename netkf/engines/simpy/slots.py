@@ -165,6 +165,11 @@ class SlotNode(Node):
                     self._perform(stage, slot)
             slot += 1
 
+    @property
+    def estimates_at(self) -> int:
+        """The slot that the estimate is of."""
+        return self._slot
+
     def restart(self, time: float, fresh: Callable[[float], tuple[FloatArray, FloatArray]]) -> None:
         """Begin again with the estimate ``fresh(slot)`` of the present slot."""
         super().restart(self._slot, fresh)

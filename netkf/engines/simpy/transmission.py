@@ -99,6 +99,8 @@ class Transmitter:
         self._encoders = encoders(scenario, streams)
         # The last payload of each sender, as the filter made it and as it is received.
         self._encoded: dict[int, tuple[Any, Any]] = {}
+        # Where the coordinates of a sender (id) begin now, if they move along with an input.
+        self.origin_of: Callable[[int], FloatArray] | None = None
         self._horizon, self._until = scenario.horizon, scenario.end_time
         self._instant = scenario.time_grid.instant
         # Of nodes that move: who hears whom. Set when the true state of the run is known.
@@ -210,7 +212,14 @@ class Transmitter:
         if not self._encoders:
             return payload
         if sender not in self._encoded or self._encoded[sender][0] is not payload:
-            encoded, clipped = self._encoders[sender].encode(payload)
+            encoder, encoded = self._encoders[sender], payload
+            if self.origin_of is None:
+                encoded, clipped = encoder.encode(encoded)
+            else:
+                # The numbers of the message are those of absolute states.
+                shift, origin = self._scenario.node_filter.shift, self.origin_of(sender)
+                encoded, clipped = encoder.encode(shift(encoded, origin))
+                encoded = shift(encoded, -origin)
             self._encoded[sender] = payload, encoded
             if clipped:
                 row = (self._timeline.now, CLIP, sender, -1, clipped, phase, NAN)
