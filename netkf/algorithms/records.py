@@ -34,8 +34,8 @@ FIELDS = ("node", "past", "link", "scratch", "settings")
 """Tables of a Record whose arrays and numbers are fields of one struct."""
 HELD = ("xhat", "root", "payload", "kept", "room")
 """Fields that each such struct may have besides."""
-RESERVED = frozenset([*dir(Struct), *Struct.__annotations__, "view"])
-"""What structs, and numba, take for something else."""
+RESERVED = ("address", "memory", "general", "struct_kinds", "struct_offsets", "_keep_alive", "view")
+"""What structs read of themselves, and what numba allows of arrays only."""
 
 
 @dataclass(frozen=True)

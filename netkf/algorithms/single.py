@@ -394,11 +394,12 @@ def emit(state: NodeState, exchange: Any) -> tuple[NodeState, Payload | None]:
     payload = cls(**{k: np.zeros((count, *a.shape[1:]), a.dtype) for k, a in former.items()})
     record.payload = payload
     call_kernel(state.kernels.emit, record, 0, 0, run=run)
-    if not (run.sends[0] or state.kernels.decides):
-        raise ContractError("emit writes 0 into run.sends: write Kernels(decides=True)")
     has_reading = new.reading is not None
-    silent = exchange.slot >= 0 and not surroundings.sends(exchange.phase, has_reading)
-    if silent or not run.sends[0]:
+    if exchange.slot >= 0 and not surroundings.sends(exchange.phase, has_reading):
+        return new, None
+    if not run.sends[0]:
+        if not state.kernels.decides:
+            raise ContractError("emit writes 0 into run.sends: write Kernels(decides=True)")
         return new, None
     fields = {name: getattr(payload, name) for name in cls.struct_fields}
     return new, Payload(fields, new.reading, new)
