@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.core.errors import ScenarioError
+from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.fields import Component
+from netkf.network.graph_files import as_graph
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import replaces_key, split_path
 from netkf.scenario.values import parse_values, split_setting
@@ -82,7 +83,8 @@ def values_of_grid(grid: Any) -> dict[str, list[Any]]:
         if not listed:
             raise ScenarioError("--vary", f"{key} needs a list of values", values, "give some")
         plain = values.tolist() if isinstance(values, np.ndarray) else list(values)
-        values_by_key[str(key)] = stored = list(map(_storable, plain))
+        with errors_under(str(key)):
+            values_by_key[str(key)] = stored = list(map(_storable, plain))
         for value, count in Counter(map(_text, stored)).items():
             if count > 1:
                 rule = f"{key} has one value {count} times"
@@ -97,6 +99,7 @@ def values_of_grid(grid: Any) -> dict[str, list[Any]]:
 
 def _storable(value: Any) -> Any:
     """Return a value as manifests and tables of results can hold it, parts as their tables."""
+    value = as_graph(value)
     if isinstance(value, Component):
         return part_as_table(value)
     return value.isoformat() if isinstance(value, (date, clock_time)) else value

@@ -68,6 +68,15 @@ def scalar_traces(slots, predicts, R=0.5):
 # Grids
 
 
+def test_graphs_of_networkx_are_told_apart_by_their_links(short):
+    networkx = pytest.importorskip("networkx")
+    graphs = [networkx.cycle_graph(6), networkx.path_graph(6)]
+    found = sweep(short, {"network.graph": graphs}, runs=2, workers=1)["network.graph"]
+    assert [text.count("], [") for text in found] == [5, 4]
+    with pytest.raises(ScenarioError, match=r"network\.graph.*a link must join two nodes"):
+        sweep(short, {"network.graph": [networkx.Graph([(0, 0)])]})
+
+
 def test_grids_are_lists_ranges_tables_and_words():
     texts = ["a.b=1,2.5", 'f={kind="local"},{kind="hybrid", epsilon=0.3}', "w=metropolis,fast"]
     texts += ["n=1:5:3", "x=0:1:5", "R=[[1.0]],[[2.0, 3.0]]", 's="a,b",c']
