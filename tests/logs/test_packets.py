@@ -12,7 +12,7 @@ import pytest
 import netkf
 from netkf.cli.main import main
 from netkf.core.errors import ScenarioError
-from netkf.logs.packets import find_lead, unwrap
+from netkf.logs.packets import choose_origin, find_lead, unwrap
 from netkf.scenario.writing import as_table, to_toml
 from tests.conftest import SCENARIOS
 
@@ -202,6 +202,28 @@ def test_a_silent_receiver_has_a_hole_if_others_hear(tmp_path):
     assert accounts.loc[(3, 2)].tolist() == [200, 140, 30, 30]
     assert accounts.loc[(3, 1)].tolist() == [200, 130, 70, 0]
     assert "2 reports nothing from 51 to 80 s" in (tmp_path / "out" / "report.txt").read_text()
+
+
+@pytest.mark.parametrize("why", ["it logs what it sends", "one sender", "hardly heard"])
+def test_losses_in_a_row_are_no_hole_in_the_log_of_their_receiver(tmp_path, why):
+    """Node 1 misses 400 packets in a row that nodes 0 and 2 hear."""
+    rows = ["t,src,dst,seq"]
+    for k in range(800):
+        senders = (3,) if why == "one sender" and k >= 400 else (3, 4)
+        rows += [f"{k},{sender},,{k}" for sender in (*senders, *(1,) * (why[:7] == "it logs"))]
+        for sender in senders:
+            hears = k < 400 and (why != "hardly heard" or k % 10 == 0)
+            rows += [f"{k}.5,{sender},{receiver},{k}" for receiver in (0, 2, *(1,) * hears)]
+    netkf.import_log(write(tmp_path / "log.csv", rows), "csv", tmp_path / "out")
+    accounts = table(tmp_path / "out", "accounts.csv").set_index(["sender", "receiver"])
+    heard = 40 if why == "hardly heard" else 400
+    assert accounts.loc[(3, 1)].tolist() == [800, heard, 800 - heard, 0]
+
+
+def test_nothing_is_sent_at_the_origin_of_a_log():
+    stamps = [[0, 5], [3, 50], [3, 20], [1000, 1001], [1000.5, 1001]]
+    origins = [choose_origin([Decimal(t) for t in pair], 0.001) for pair in stamps]
+    assert origins == [-1, 0, 2, 999, 1000]
 
 
 @pytest.mark.parametrize("modulus", [16, 256, 65536])
@@ -495,6 +517,10 @@ def test_a_run_written_as_a_log_comes_back_to_the_bit(name, engine, tmp_path):
 CAUSES = {
     "lives": {"lives": [{"kind": "crashes", "nodes": [1], "mean_up": 2.0, "mean_down": 1.0}]},
     "radio": {"radio": {"bits_per_second": 2000.0, "frame_bytes": 20}},
+    "radio alone": {
+        "radio": {"bits_per_second": 2000.0, "frame_bytes": 20},
+        "channel": {"symmetric": False},
+    },
     "clocks": {"clocks": [{"nodes": [0], "offset": 0.05, "drift": -1e-3}]},
 }
 
@@ -514,10 +540,12 @@ def test_a_log_counts_a_cause_once(cause, tmp_path):
     run = netkf.simulate(scenario, engine="simpy")
     netkf.export_log(run, tmp_path / "log")
     _, notes = netkf.import_log(tmp_path / "log", "csv", tmp_path / "out")
-    assert any("the rate of network.radio" in note for note in notes) == (cause == "radio")
-    replay = netkf.simulate(netkf.load(tmp_path / "out" / "scenario.toml"), engine="simpy")
-    assert netkf.first_difference(run, replay) is None
-    np.testing.assert_array_equal(run.xhat, replay.xhat)
+    assert any("the rate of network.radio" in note for note in notes) == ("radio" in cause)
+    netkf.export_recorded(run, tmp_path / "twin")
+    for folder in ("out", "twin"):
+        replay = netkf.simulate(netkf.load(tmp_path / folder / "scenario.toml"), engine="simpy")
+        assert netkf.first_difference(run, replay) is None
+        np.testing.assert_array_equal(run.xhat, replay.xhat)
 
 
 SOME_LINKS = {
@@ -602,6 +630,16 @@ def test_a_log_beneath_a_filter_that_exchanges_in_pairs(rows, sent, told, tmp_pa
     log = write(tmp_path / "log.csv", ["t,sender,receiver,number,heard", *both])
     with pytest.raises(ScenarioError, match="nodes send broadcasts, as in the log"):
         netkf.import_log(log, "csv", tmp_path / "no", like=tmp_path / "pairs.toml")
+
+
+def test_pairs_of_a_log_exchange_in_the_slot_of_their_stamp(tmp_path):
+    # In floats 0.3 is less than three times 0.1.
+    rows = ["t,sender,receiver,number,heard", "0.3,0,1,0,1", "0.3,1,0,0,1", "0.65,0,1,1,0"]
+    text = PAIRS.replace("period = 1.0", "period = 0.1").replace("probe = 1.0", "probe = 0.1")
+    (tmp_path / "pairs.toml").write_text(text)
+    log, like = write(tmp_path / "log.csv", rows), tmp_path / "pairs.toml"
+    netkf.import_log(log, "csv", tmp_path / "out", like=like)
+    assert table(tmp_path / "out", "transmissions.csv")["slot"].tolist() == [3, 6]
 
 
 def test_what_nobody_in_the_scenario_sent_is_dropped_and_told(tmp_path):
@@ -813,7 +851,8 @@ def test_a_log_counts_from_the_origin_of_the_scenario_that_it_is_like(tmp_path):
     epoch = 1_700_000_010 * 10**9
     speeds = [f"{epoch + 5 * 10**8 * k},{node},{k}" for k in range(9) for node in "ab"]
     write(tmp_path / "speed.csv", ["t,node,u0", *speeds])
-    sent = [(-1.5, "a", 0), (0.5, "a", 1), (1.25, "b", 0), (2.5, "a", 2), (5.0, "b", 1)]
+    sent = [(-1.5, "a", 0), (0.0, "a", 1), (0.5, "a", 2), (1.25, "b", 0), (2.5, "a", 3)]
+    sent.append((5.0, "b", 1))
     lost = {2.5}
     rows = ["time,src,dst,seq,heard"]
     for t, node, k in sent:
@@ -821,7 +860,7 @@ def test_a_log_counts_from_the_origin_of_the_scenario_that_it_is_like(tmp_path):
         rows.append(f"{epoch + round(t * 1e9)},{node},{other},{k},{int(t not in lost)}")
     log, like = write(tmp_path / "log.csv", rows), tmp_path / "robots.toml"
     _, notes = netkf.import_log(log, "csv", tmp_path / "out", like=like)
-    assert "dropped: sent by [time] origin of the scenario: 1" in notes
+    assert "dropped: sent by [time] origin of the scenario: 2" in notes
     scenario = netkf.load(tmp_path / "out" / "scenario.toml")
     run = netkf.simulate(scenario, engine="simpy")
     events = run.events

@@ -109,6 +109,55 @@ def test_an_outlier_is_refused_with_the_probability_of_its_spread(scenario_of):
         assert value == pytest.approx(scipy.stats.chi2.sf(limit * S / (S + 4.0), 1), rel=1e-9)
 
 
+def test_of_two_values_that_with_the_most_noise_hides_an_outlier_best(scenario_of):
+    outliers = scenario_of('{ kind = "outliers", probability = 0.1, sigma = 2.0 }')
+    both = {"sensors.0.H": [[1.0], [1.0]], "sensors.0.R": [[0.1, 0.0], [0.0, 0.9]]}
+    limit = scipy.stats.chi2.ppf(0.99, 2)
+    expected = scipy.stats.chi2.sf(limit * 0.9 / (0.9 + 4.0), 2)
+    assert of(outliers.replace(both)).knowing[0] == pytest.approx(expected, rel=1e-9)
+
+
+def test_readings_are_looked_at_from_the_first_to_before_the_horizon(scenario_of):
+    found = of(scenario_of('{ kind = "biased", size = 1.5 }'))
+    assert found.times.tolist() == list(range(1, 40))
+
+
+CLOCKED = {
+    "plant": {"kind": "diffusion", "A": [[-0.05]], "B": [[0.05]]},
+    "sensors.0.sampling": {"kind": "periodic", "period": 1.0},
+}
+PHASE = {"kind": "periodic", "period": 1.0, "phase": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("changes", "known"),
+    [
+        (CLOCKED, True),
+        ({**CLOCKED, "sensors.0.sampling": PHASE}, False),
+        ({"plant.schedule": [{"from": 10.0, "F": [[0.9]]}]}, False),
+        ({"filter.model.R": [[2.0]]}, False),
+        ({"filter.model.Q": [[2.0]]}, False),
+    ],
+)
+def test_what_follows_of_no_steady_consistent_filter_is_not_known(scenario_of, changes, known):
+    scenario = scenario_of('{ kind = "biased", size = 1.5, since = 5.0 }').replace(changes)
+    assert (of(scenario) is not None) is known
+
+
+def test_who_knows_the_state_notices_a_drift_before_who_hears_nobody(scenario_of):
+    (P, K), e, first = steady(), 0.0, {}
+    for t in range(1, 40):
+        z = 0.1 * t - e
+        for who, tail in (("alone", normal_tail(z, P + R)), ("knows", normal_tail(0.1 * t, R))):
+            if tail >= 0.5:
+                first.setdefault(who, t)
+        e = F * (e + K * z)
+    assert first["knows"] < first["alone"]
+    rows = netkf.theory.assumptions(scenario_of('{ kind = "drifting", rate = 0.1 }'))
+    evidence = rows[rows["assumption"] == "all sensors are healthy"].iloc[0]["evidence"]
+    assert f"1/2 from {first['alone']} s on and from {first['knows']} s on" in evidence
+
+
 @pytest.mark.parametrize(
     ("fault", "gate", "words"),
     [

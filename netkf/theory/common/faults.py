@@ -47,11 +47,14 @@ class _Alone(NamedTuple):
 
 
 def refusals(scenario: Scenario, node: int, placed: PlacedSensor) -> Refusals | None:
-    """Return how likely the gate refuses readings of a bad sensor; None if not fixed beforehand."""
+    """Return how likely the gate refuses readings of a bad sensor; None if not fixed beforehand,
+    as where filters believe in other matrices than the true ones.
+    """
     gate, fault = scenario.filter.gate, scenario.fault_of(node, placed)
     sensor = scenario.sensors[placed.entry]
     step = _step(scenario, placed)
-    if gate is None or fault is None or step is None or sensor.varying or not sensor.linear:
+    is_steady = sensor.linear and not sensor.varying and scenario.filters_know_the_truth
+    if gate is None or fault is None or step is None or not is_steady:
         return None
     R = scenario.noise_covariance(placed.entry, believed=True)
     # The first reading of a sensor, in slots too where most filters have none in slot 0.
