@@ -15,7 +15,9 @@ import scipy.linalg
 import netkf
 from netkf.algorithms.traits import Timing
 from netkf.core.errors import NetkfError, TheoryError
+from netkf.core.fields import SourceFile
 from netkf.parts import Filter, Filtering, Local
+from netkf.plants.inputs import RecordedInput
 from netkf.rng.streams import Streams
 from netkf.runs.labels import mismatch_note
 from netkf.scenario.reading import from_table
@@ -257,6 +259,27 @@ def test_kcf_replays_recorded_readings_of_a_driven_plant(engine, tmp_path):
         np.testing.assert_allclose(run.P[k], P, rtol=1e-9, atol=1e-9)
     use = record_usage(driven, None)["plant.input"]
     assert (use["rows"], use["unused"]) == (8, 1)  # 3.9 is over in slot 4
+
+
+@pytest.mark.parametrize("wrong", ["A", "input"])
+def test_means_of_errors_of_nodes_that_read_increments_by_a_wrong_model(wrong, tmp_path):
+    """Without noise errors are their means, but for the steps in which sensors integrate."""
+    (tmp_path / "u.csv").write_text("t,u0\n0,1\n0.55,-6\n2.3,4\n")
+    sensors = [{"nodes": [0, 2], "H": [[1.0, 0.4]], "R": [[1e-22]]}]
+    model = {"B": [[0.5, 0.0], [0.1, 0.4]], "R": [[0.3]]}
+    model |= {"A": [[-0.3, 0.8], [0.1, -0.2]]} if wrong == "A" else {"input": False}
+    u = RecordedInput(path=SourceFile("u.csv", tmp_path), G=[[1.0], [0.5]])
+    clock = {"kind": "periodic", "period": 1.0, "at": "links"}
+    filtering = {**HYBRID, "mean": [0.0, 0.0], "cov": [[1.0, 0.0], [0.0, 1.0]]}
+    still = {**FLOW, "B": [[0.0, 0.0], [0.0, 0.0]], "sensing_period": 1e-3}
+    one = scenario(filtering, still, clock, None, 4.0, model, sensors=sensors)
+    one = one.replace({"plant.cov": [[0.0, 0.0], [0.0, 0.0]], "probe": 0.8})
+    if wrong == "input":
+        one = one.replace({"plant.input": u})
+    run = netkf.simulate(one, engine="simpy")
+    mean = error_law(one, run).mean.reshape(run.error.shape)
+    assert np.abs(mean).max() > 0.5
+    np.testing.assert_allclose(run.error, mean, atol=2e-3)
 
 
 def test_states_between_the_probes_have_the_response_of_their_instant():

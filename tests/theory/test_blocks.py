@@ -186,7 +186,11 @@ def test_errors_of_local_filters_of_blocks_are_jointly_those_of_kalman_filters(
     [ROBOTS, pytest.param(CLOCKED, marks=pytest.mark.slow)],
     ids=["slots", "clocks"],
 )
-def test_blocks_that_change_and_whose_input_is_not_known(tmp_path: Path, text: str) -> None:
+def test_blocks_that_change_and_whose_input_is_not_known(
+    tmp_path: Path, text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # So few columns that they have to be turned into fewer.
+    monkeypatch.setattr(block_columns, "SPARE", 40)
     changed = "F = [[1.1]]" if text == ROBOTS else "A = [[0.2]]"
     G = 'input = { kind = "constant", G = [[1.0]], value = [0.4] }\ncov = [[1.0]]'
     text = text.replace("cov = [[1.0]]", f"schedule = [{{ from = 5.0, {changed} }}]\n{G}")
@@ -199,6 +203,10 @@ def test_blocks_that_change_and_whose_input_is_not_known(tmp_path: Path, text: s
     added = run.error - netkf.simulate(known).error
     np.testing.assert_allclose(law.mean.reshape(added.shape), added, rtol=1e-9, atol=1e-9)
     assert np.abs(added).max() > 0.1
+    # On a tree P is the covariance of the error.
+    exact = load(text, tmp_path, filter__kind="block-belief-propagation")
+    run = netkf.simulate(exact)
+    np.testing.assert_allclose(error_covariance(exact, run), run.P, rtol=1e-9)
 
 
 @pytest.mark.parametrize("rule", ["split", "ci"])

@@ -7,6 +7,7 @@ import scipy.linalg
 import netkf
 from netkf import theory
 from netkf.scenario.reading import from_table
+from netkf.theory.common import clock_columns
 from netkf.theory.common.arrivals import with_last_exchanges
 from netkf.theory.errors import error_law
 from tests.conftest import SCENARIOS
@@ -68,6 +69,7 @@ CASES = [
 ]
 SEVERAL_CLOCKS = {"hybrid", "intersection", "diffusion"}
 LONG = {"kind": "periodic", "period": 100.0}
+UNSTABLE = {"kind": "diffusion", "A": [[0.5, 1.0], [0.0, 0.3]], "B": [[0.8, 0.0], [0.1, 0.5]]}
 STARTS = [[0.7, -0.4], [1.5, 0.2], [-2.0, 3.0], [0.0, 0.1]]
 SAMPLES_ONLY = {"intermittent", "dropping", "window", "push-sum", "kcf"}
 
@@ -170,14 +172,8 @@ def test_the_mean_of_errors_is_what_other_starts_add(name, at, tmp_path):
 @pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", ["intermittent", "gossip"])
 def test_on_unstable_plants_errors_keep_their_digits_and_their_law(name, tmp_path):
-    # The origin moves after 10 and 20 seconds.
-    plant = {"kind": "diffusion", "A": [[0.5, 1.0], [0.0, 0.3]], "B": [[0.8, 0.0], [0.1, 0.5]]}
-    sensors = [
-        {**SAMPLED[0], "nodes": [0, 1, 2, 3], "sampling": {"kind": "periodic", "period": 0.5}}
-    ]
-    more = {"plant": {**plant, "cov": [[1.0, 0.2], [0.2, 2.0]]}, "horizon": 29.0, "probe": 0.25}
-    at = "links" if name == "gossip" else "readings"
-    scenario = scenario_of(name, at, LATE, sensors, tmp_path, **more)
+    # The origin moves after 15 seconds.
+    scenario = unstable(name, 29.0, tmp_path).replace({"probe": 0.25})
     runs = [netkf.simulate(scenario, engine=engine) for engine in ("simpy", "compiled")]
     exact = theory.error_covariance(scenario, runs[0])
     close(error_law(scenario, runs[0]).P, runs[0].P, 1e-9)
@@ -185,6 +181,44 @@ def test_on_unstable_plants_errors_keep_their_digits_and_their_law(name, tmp_pat
         nees = np.einsum("tia,tiab,tib->ti", run.error, np.linalg.inv(exact), run.error)
         assert nees.max() < 45.0  # chi-square of 2 degrees, 464 times
         assert 1.0 < nees.mean() < 3.0
+
+
+@pytest.mark.parametrize("name", ["hybrid", "kcf"])
+def test_of_several_messages_that_arrive_at_once_the_newest_counts(name, tmp_path):
+    # Those sent at 0.5, 1.0 and 1.5 all arrive at 1.5, and so on.
+    rows = [f"{i},{j},{k},{1.0 - 0.5 * (k % 3):g}" for i in range(4) for j in range(4)
+            for k in range(9) if (i - j) % 4 in (1, 3)]  # fmt: skip
+    (tmp_path / "d.csv").write_text("\n".join(["sender,receiver,message,seconds", *rows]))
+    channel = {"delay": {"kind": "recorded", "path": "d.csv"}, "symmetric": False}
+    scenario = scenario_of(name, "nodes", channel, SAMPLED, tmp_path)
+    clock = {"kind": "periodic", "period": 0.5, "at": "nodes"}
+    scenario = scenario.replace({"network.activation": clock})
+    run = netkf.simulate(scenario, engine="simpy")
+    close(error_law(scenario, run).P, run.P, 1e-9)
+
+
+def unstable(name, horizon, folder):
+    at = "links" if name == "gossip" else "readings"
+    more = {"plant": {**UNSTABLE, "cov": [[1.0, 0.2], [0.2, 2.0]]}, "horizon": horizon}
+    sampled = {**SAMPLED[0], "nodes": [0, 1, 2, 3], "sampling": {"kind": "periodic", "period": 0.5}}
+    return scenario_of(name, at, LATE, [sampled], folder, probe=horizon / 20.0, **more)
+
+
+def test_a_move_of_the_origin_moves_messages_under_way_and_no_error(tmp_path, monkeypatch):
+    scenario = unstable("gossip", 8.0, tmp_path)
+    run, found = netkf.simulate(scenario, engine="simpy"), []
+    for large in (2.0, np.inf):
+        monkeypatch.setattr(clock_columns, "LARGE", large)
+        found.append(theory.error_covariance(scenario, run))
+    close(*found, 1e-9)
+
+
+def test_states_of_1e12_errors_leave_the_digits_of_a_covariance(tmp_path):
+    scenario = unstable("intermittent", 60.0, tmp_path)
+    run = netkf.simulate(scenario, engine="simpy")
+    assert np.abs(run.x[-1]).max() > 1e11
+    # A node with all readings that came to it is the Kalman filter of these.
+    close(theory.error_covariance(scenario, run), run.P, 1e-6)
 
 
 def test_the_joint_law_of_a_filter_without_readings_is_the_plants(tmp_path):
