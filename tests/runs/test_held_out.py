@@ -10,6 +10,7 @@ import netkf
 from netkf.cli.main import main
 from netkf.scenario.reading import from_table
 from netkf.scenario.writing import as_table
+from tests.algorithms.test_block_intersection import ROBOTS, load
 from tests.conftest import SCENARIOS
 
 ENGINES = "simpy", "compiled"
@@ -111,6 +112,15 @@ def test_a_record_against_a_plain_loop(tmp_path, capsys):
     assert row["expected"] == pytest.approx(np.mean(claimed), rel=1e-9)
     assert row["bias"] == pytest.approx(np.mean(errors), rel=1e-9)
     assert row["noise"] == pytest.approx(0.45)
+
+
+def test_readings_of_states_that_a_node_does_not_estimate_are_left_out(tmp_path):
+    changes = {"sensors__1__held_out": True, "sensors__0__held_out": True}
+    rows = netkf.held_out_errors(netkf.simulate(load(ROBOTS, tmp_path, **changes)))
+    # Node 1 reads its own block; what it reads of node 2 depends on that of node 2.
+    assert [row["node"] for row in rows] == [1]
+    both = load(ROBOTS, tmp_path, **changes, filter__estimates="own+neighbours")
+    assert [row["node"] for row in netkf.held_out_errors(netkf.simulate(both))] == [1, 2, 3]
 
 
 def test_the_summary_of_a_run_has_them(tmp_path, capsys):

@@ -9,7 +9,9 @@ import pytest
 
 import netkf
 from netkf.cli.main import main
-from netkf.runs.quantities import NETWORK, NetworkSink
+from netkf.runs.connectivity import newest_heard
+from netkf.runs.quantities import NETWORK, NetworkSink, sample_quantities
+from netkf.scenario.reading import from_table
 from netkf.trace.schema import CODES
 from tests.conftest import SCENARIOS
 
@@ -318,6 +320,106 @@ activation = { kind = "contacts", path = "contacts.csv", clock = { kind = "poiss
     # A node of a pair is in the largest part, and so is each of three that are alone.
     alone = 101 - 61
     assert shares.tolist() == [(41 + alone) / 101, 1.0, (41 + alone) / 101, 21 / 101]
+
+
+def test_a_link_connects_as_long_as_its_directions_both_do(tmp_path):
+    """In contact in [0, 40] and back in [0, 20] of 100 s: 41 and 21 samples at 0, 1, .. 100 s."""
+    (tmp_path / "contacts.csv").write_text("from,until,node,peer\n0,40,0,1\n0,20,1,0\n")
+    more = """
+[network]
+graph = { kind = "path", nodes = 2 }
+activation = { kind = "contacts", path = "contacts.csv", at = "directions", clock = CLOCK }
+""".replace("CLOCK", '{ kind = "poisson", rate = 1.0 }')
+    scenario_of(tmp_path, more, horizon=100.0, probe=1.0)
+    summary, _ = run_directory(tmp_path, tmp_path / "ages.toml")
+    assert [link["up"] for link in summary["connectivity"]["links"]] == [21 / 101]
+    assert summary["connectivity"]["connected"] == 21 / 101
+
+
+def test_who_goes_down_is_gone_at_the_sample_of_that_instant_and_the_radius_is_in_range(tmp_path):
+    (tmp_path / "lives.csv").write_text("t,node,what\n3,1,down\n")
+    (tmp_path / "places.csv").write_text("node,x,y\n0,0,0\n1,0.6,0.8\n")
+    more = """
+[network]
+graph = { kind = "range", radius = 1.0, nodes = 2 }
+positions = "places.csv"
+activation = { kind = "poisson", rate = 1.0 }
+[[network.lives]]
+kind = "recorded"
+nodes = [1]
+path = "lives.csv"
+"""
+    scenario_of(tmp_path, more, horizon=5.0, probe=1.0)
+    summary, _ = run_directory(tmp_path, tmp_path / "ages.toml")
+    # Up at 0, 1, 2 of the samples at 0, .. 5 s; then who is up is alone, and connected.
+    assert [link["up"] for link in summary["connectivity"]["links"]] == [0.5]
+    assert [row["time_connected"] for row in summary["nodes"]] == [1.0, 0.5]
+
+
+def test_links_over_which_nothing_was_ever_heard_are_down(tmp_path):
+    rows = [f"{i},{1 - i},{k},0\n" for i in (0, 1) for k in range(40)]
+    (tmp_path / "losses.csv").write_text("sender,receiver,message,delivered\n" + "".join(rows))
+    more = """
+[network]
+graph = { kind = "path", nodes = 2 }
+activation = { kind = "periodic", period = 0.5 }
+channel = { loss = { kind = "recorded", path = "losses.csv" } }
+"""
+    scenario = scenario_of(tmp_path, more, horizon=10.0, probe=0.5)
+    assert network(scenario)["time_connected"][-1] == 0.0
+
+
+def test_the_newest_message_that_has_come_may_have_overtaken_others():
+    arrived, sent, t = np.array([[1.0, 2.0, 3.0], [0.5, 0.2, 2.5], [0.9, 1.0, 3.0]])
+    assert newest_heard(arrived, sent, t).tolist() == [0.0, 0.5, 2.5]
+    assert newest_heard(arrived, sent, np.array([2.0])).tolist() == [0.5]
+
+
+def test_a_run_that_ended_early_has_ages_up_to_its_last_event(tmp_path):
+    more = """
+[network]
+graph = { kind = "path", nodes = 2 }
+activation = { kind = "periodic", period = 1.0 }
+channel = { loss = { kind = "bernoulli", delivery = 0.0 } }
+"""
+    scenario = scenario_of(tmp_path, more, horizon=9.0, probe=9.0)
+    sink, log = NetworkSink(scenario, 1, 0), netkf.simulate(scenario, engine="simpy").log
+    sink.events(log[log["t"] <= 4.0])
+    assert sink.values(complete=False)[1, :2].tolist() == [2.0, 4.0]
+
+
+def test_slots_without_a_row_bring_no_reading(tmp_path):
+    """Rows of slots 1 and 3 of 0 .. 7: the oldest that node 1 knows is of 3 s, at 8 s."""
+    (tmp_path / "y.csv").write_text("t,node,y0\n1,0,0.5\n3,0,0.1\n")
+    sensor = {"kind": "recorded", "nodes": [0], "path": "y.csv", "H": [[1.0]], "R": [[1.0]]}
+    table = {
+        "format": 1, "name": "rows", "horizon": 8.0, "probe": 1.0, "sensors": [sensor],
+        "plant": {"kind": "unknown", "F": [[0.9]], "Q": [[1.0]], "period": 1.0, "cov": [[1.0]]},
+        "network": {
+            "graph": {"kind": "path", "nodes": 2}, "activation": {"kind": "broadcast"},
+        },
+        "filter": {"kind": "kcf", "epsilon": 0.1},
+    }  # fmt: skip
+    assert network(from_table(table, tmp_path))["worst_age"][1] == 5.0
+
+
+def test_one_sample_that_is_nan_leaves_nothing_of_its_node_and_of_all(ring):
+    squares = np.ones((4, len(ring.nodes)))
+    squares[2, 1] = np.nan
+    found = sample_quantities(ring, squares)
+    assert np.isnan(found[[1, -1]]).all()
+    assert (found[0] == found[0, 0]).all()
+
+
+def test_bytes_are_those_of_each_exchange(tmp_path):
+    file = SCENARIOS / "push_sum_planar.toml"
+    scenario = netkf.load(file).replace({"horizon": 1.0})
+    found, run = network(scenario), netkf.simulate(scenario, 1, engine="simpy")
+    sends = run.events[run.events["kind"] == "send"].drop_duplicates(["t", "node", "phase"])
+    sizes = [scenario.message_size(node, phase)
+             for node, phase in zip(sends["node"], sends["phase"], strict=True)]  # fmt: skip
+    assert len(set(sizes)) > 1
+    assert found["bytes"][-1] == sum(sizes)
 
 
 def test_both_engines_and_ensembles_agree(tmp_path):

@@ -55,6 +55,17 @@ def test_a_broadcast_by_a_clock_is_one_transmission(size):
     assert found.transmissions([4, 5, 6]) == [2, 1, 0]  # node 5 had no hearer
 
 
+@pytest.mark.parametrize("size", [1, 2, 3, 9])
+def test_messages_of_a_step_are_one_transmission_whatever_lies_between(size):
+    # Two exchanges at one instant, and a third one later.
+    rows = np.zeros(9, dtype=EVENT)
+    rows["kind"], rows["node"] = CODES["send"], [0, 0, 1, 0, 0, 1, 0, 1, 1]
+    rows["phase"], rows["t"] = [0, 0, 0, 0, 1, 1, 1, 0, 0], [1] * 7 + [2] * 2
+    found = counted(rows, size)
+    assert found.transmissions([0, 1]) == [2, 3]
+    assert list(found.by_phase([0, 1])) == [(0, [1, 2]), (1, [1, 1])]
+
+
 def test_the_table_shows_transmissions_that_differ_from_messages():
     messages = {"sent": 3, "delivered": 3, "lost": 0, "in_flight": 0, "transmissions": 2}
     row = dict.fromkeys(("rms_error", "mean_trace", "bound", "ratio", "mean_nees"), 1.0)
