@@ -147,23 +147,25 @@ def ages_by_hand(scenario, log, sources):
     return mean, worst
 
 
+SHORT = {"horizon": 1.0, "probe": 0.5}
 FILTERS = {
     "combining": {},
     "swapping": {"filter": {"kind": "gossip"}},
     "samples": {"sensors.0.sampling": {"kind": "poisson", "rate": 1.0}},
     "delayed": {"network.channel.delay": {"kind": "exponential", "mean": 1.0}},
+    "late in slots": {**SHORT, "network.channel.delay": {"kind": "exponential", "mean": 0.01}},
     "crashes in slots": {
-        "network.lives": [{"kind": "crashes", "nodes": [1, 2], "mean_up": 0.5, "mean_down": 0.1}]
+        **SHORT,
+        "network.lives": [{"kind": "crashes", "nodes": [1, 2], "mean_up": 0.5, "mean_down": 0.1}],
     },
 }
 
 
-@pytest.mark.one_in(3)
 @pytest.mark.parametrize("case", [*FILTERS, "readings alone", "swaps in slots"])
 def test_ages_by_hand(case):
     """Messages that combine, replace, are delayed or tell readings only; many in flight."""
     files = {"readings alone": "intermittent_random10", "swaps in slots": "gossip_ring"}
-    files["crashes in slots"] = "push_sum_planar"
+    files |= dict.fromkeys(("crashes in slots", "late in slots"), "push_sum_planar")
     scenario = netkf.load(SCENARIOS / f"{files.get(case, 'poisson_ring')}.toml")
     scenario = scenario.replace(FILTERS.get(case, {}))
     run = netkf.simulate(scenario, seed=4, engine="simpy")
