@@ -6,6 +6,7 @@ A record is one outcome and does not show the law that it came from: the verdict
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 from netkf.core.errors import TheoryError
 from netkf.network.recorded import RecordedDelay, RecordedLoss
@@ -89,6 +90,7 @@ def no_channel_law(scenario: Scenario) -> str:
     return f"{reason}: what arrives has no known law"
 
 
+@lru_cache(maxsize=8)
 def lacks_channel_law(scenario: Scenario) -> bool:
     """Return True if losses or delays are read from a table, nodes move or are down, or the loss
     does not say how often messages arrive.
