@@ -82,6 +82,10 @@ class NodeTime(NamedTuple):
         """Return what the clock shows at ``time``, both in seconds."""
         return self.grid.instant(self.offset + self.pace * time)
 
+    def time_of(self, shown: float) -> float:
+        """Return the time at which the clock shows ``shown``, both in seconds."""
+        return (shown - self.offset) / self.pace
+
     def ahead(self, clock: Clock) -> float:
         """Return how far ticks of a ``clock`` are ahead at time 0 (s): rows of a table and lattices
         are in local time, others count gaps from 0 on.

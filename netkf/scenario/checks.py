@@ -239,10 +239,10 @@ def _pauses_increments(scenario: DerivedScenario) -> bool:
 
 
 def _check_owners(scenario: DerivedScenario, name: str, entries: Sequence[Any]) -> None:
-    """Raise ScenarioError unless nodes are in one each of ``entries``, and take samples where the
-    filter cannot go without increments for a time, or the clocks of nodes are wrong.
+    """Raise ScenarioError unless nodes are in one each of ``entries``, and nodes with lives take
+    samples where the filter cannot go without increments for a time.
     """
-    needs_samples = name == "clocks" or not _pauses_increments(scenario)
+    needs_samples = name == "lives" and not _pauses_increments(scenario)
     owners: dict[int, int] = {}
     for k, entry in enumerate(entries):
         for node in entry.nodes:
@@ -251,11 +251,8 @@ def _check_owners(scenario: DerivedScenario, name: str, entries: Sequence[Any]) 
                 rule = f"must not have a node of network.{name}[{owners[node]}]"
                 raise ScenarioError(key, rule, node, "give each node one entry")
             if needs_samples and node in scenario.increment_sensors:
-                rule = (
-                    "cannot have a node whose sensors give increments, only one where they sample"
-                )
-                if name == "lives":
-                    rule += f", with the {filter_name(scenario)}"
+                rule = "cannot have a node whose sensors give increments, only one where they "
+                rule += f"sample, with the {filter_name(scenario)}"
                 remedy = 'write sampling = { kind = "periodic", period = ... } in its [[sensors]]'
                 raise ScenarioError(key, rule, node, remedy)
     if owners and name == "clocks" and scenario.node_filter.timing.pooled:

@@ -784,6 +784,12 @@ class ScenarioModel(Component):
     def _mean_deliveries(self) -> dict[Link, float]:
         return {}
 
+    @property
+    def has_mistimed_increments(self) -> bool:
+        """True if the clock of a node whose sensors give increments is wrong."""
+        nodes = {node for clock in self.network.clocks for node in clock.nodes}
+        return not nodes.isdisjoint(self.increment_sensors)
+
     @cached_property
     def increment_sensors(self) -> dict[int, tuple[PlacedSensor, ...]]:
         """The sensors of each node that give increments of a diffusion; empty in slots."""

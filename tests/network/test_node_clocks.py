@@ -5,6 +5,7 @@ import itertools
 
 import numpy as np
 import pytest
+import scipy.integrate
 import scipy.linalg
 
 import netkf
@@ -54,6 +55,7 @@ nodes = [2]
 offset = -0.08
 drift = -0.02
 """
+PERIODIC = {"kind": "periodic", "period": 0.5}
 OFFSET, DRIFT = (0.0, 0.17, -0.08), (0.0, 0.01, -0.02)
 A, BB = np.array([[0.2, 1.0], [-1.0, -0.1]]), np.diag([0.04, 1.0])
 H, R = np.array([[1.0, 0.0]]), np.array([[0.3]])
@@ -146,6 +148,36 @@ def test_estimates_are_those_of_the_plain_recursion(scenario_of, delay, engine):
     assert np.abs(run.x[-1] - run.xhat[-1]).max() > 0.05
 
 
+def test_increments_are_taken_for_those_of_the_time_that_passed_by_the_clock(scenario_of):
+    """dy = H x dt without noise: by a clock that shows s = offset + pace t it is H x / pace ds."""
+    scenario = scenario_of(filter_="local", horizon=4.0).replace(
+        {"sensors": [{"nodes": [0, 1, 2], "H": H.tolist(), "R": [[1e-22]]}]}
+    )
+    with pytest.raises(netkf.EngineError, match="increments at nodes whose clocks are wrong"):
+        netkf.simulate(scenario, engine="compiled")
+    run = netkf.simulate(scenario)
+    for node, drift in enumerate(DRIFT):
+        pace = 1.0 + drift
+
+        def slope(t, y, pace=pace):
+            x, xhat, P = y[:2], y[2:4], y[4:].reshape(2, 2)
+            gain = P @ H.T @ np.linalg.inv(R)
+            dP = A @ P + P @ A.T + BB - gain @ R @ gain.T
+            dxhat = pace * A @ xhat + gain @ H @ (x - pace * xhat)
+            return np.concatenate([A @ x, dxhat, pace * dP.ravel()])
+
+        start = [2.0, -3.0, 0.5, 0.0, 1.0, 0.2, 0.2, 2.0]
+        y = scipy.integrate.solve_ivp(
+            slope, (0.0, 4.0), start, "DOP853", run.times, rtol=1e-11, atol=1e-12
+        ).y.T
+        np.testing.assert_allclose(run.x, y[:, :2], atol=1e-8)
+        np.testing.assert_allclose(run.P[:, node], y[:, 4:].reshape(-1, 2, 2), atol=1e-8)
+        # Gains of two moments of the increments; the drifts make a thousand times as much.
+        np.testing.assert_allclose(run.xhat[:, node], y[:, 2:4], atol=5e-5)
+    with pytest.raises(netkf.TheoryError, match="not of those that give increments"):
+        netkf.theory.error_covariance(scenario, run)
+
+
 def test_ticks_and_samples_are_at_local_times(scenario_of):
     log = netkf.simulate(scenario_of(), seed=1).log
     for kind, period in (("sense", 0.5), ("tick", 0.3)):
@@ -236,6 +268,9 @@ def test_lattices_are_of_local_times_whatever_the_clock_shows(clock, offset):
 )
 def test_right_clocks_are_no_clocks(scenario_of, at, kind, engine):
     none = scenario_of(clocks="", filter_=kind, at=at)
+    if engine == "simpy":
+        sampled = {"nodes": [1], "H": H.tolist(), "R": [[0.3]], "sampling": PERIODIC}
+        none = none.replace({"sensors": [{"nodes": [0], "H": H.tolist(), "R": [[0.3]]}, sampled]})
     right = none.replace({"network.clocks": [{"nodes": [0, 2]}]})
     run, same = (netkf.simulate(s, seed=2, engine=engine) for s in (none, right))
     assert run.log.tobytes() == same.log.tobytes()
@@ -346,7 +381,6 @@ def test_drawn_clocks_differ_by_node_and_run_and_have_their_law(scenario_of):
         ({"network.clocks": [{"nodes": [1], "offset": {"s": 1.0}}]}, "network.clocks[0].offset"),
         ({"network.clocks": {"nodes": [1]}}, "network.clocks"),
         ({"filter": {"kind": "central"}}, "network.clocks"),
-        ({"sensors": [{"nodes": [1], "H": [[1.0, 0.0]], "R": [[1.0]]}]}, "network.clocks[0].nodes"),
         ({"plant.input": {"kind": "constant", "G": [[1.0], [0.0]], "value": [1.0]}}, "clocks"),
         ({"sensors": [{"kind": "recorded", "path": "y.csv", "H": [[1.0, 0.0]], "R": [[1.0]]}]},
          "got [2]; leave these out"),

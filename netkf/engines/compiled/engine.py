@@ -80,6 +80,8 @@ class CompiledEngine(Engine):
             rule = unquantised
         elif (ungated := ungated_readings(scenario)) is not None:
             rule = f"a gate on {ungated}"
+        elif scenario.has_mistimed_increments:
+            rule = "sensors that give increments at nodes whose clocks are wrong"
         elif (outcomes := unknown_outcomes(scenario)) is not None:
             rule = outcomes
         if rule:

@@ -393,8 +393,9 @@ class ClockedNode(Node):
         super().__init__(*arguments)
         self._timeline, self._recorder, self._truth = timeline, recorder, truth
         self._increments, self._clock = increments, clock
-        # The time in seconds by its clock, to which the filter is predicted.
-        self._now = clock.shows(0.0)
+        # The time in seconds by its clock, to which the filter is predicted, and that up to which
+        # it has used increments.
+        self._now, self._read_to = clock.shows(0.0), 0.0
         # The samples of the present instant, until the update that uses all of them.
         self._samples: list[tuple[int, FloatArray, Any, FloatArray]] = []
         self._pairs: list[tuple[int, PairReading]] = []
@@ -406,7 +407,7 @@ class ClockedNode(Node):
     def restart(self, time: float, fresh: Callable[[float], tuple[FloatArray, FloatArray]]) -> None:
         """Begin again at ``time`` seconds with the estimate ``fresh(time)``."""
         super().restart(time, fresh)
-        self._now = self._clock.shows(time)
+        self._now, self._read_to = self._clock.shows(time), time
 
     def set_up(self, up: bool, time: float) -> None:
         """Use increments from ``time`` (seconds) on, or no more; a filter that all nodes share has
@@ -420,7 +421,7 @@ class ClockedNode(Node):
         """Predict the filter to ``time`` (seconds), using the increments since its last event; what
         passes for it is time by its clock.
         """
-        time = self._clock.shows(time)
+        true_time, time = time, self._clock.shows(time)
         if self._now >= time:
             return
         if isinstance(self.moving_model, ChangingFlowModel | RateModel):
@@ -441,15 +442,17 @@ class ClockedNode(Node):
             # Predict first: the increments of a gap are an observation at its end.
             gap = end - self._now
             self._predict(self._now, gap)
-            moments = self._read(self._now, end)
+            moments = self._read(true_time if end == time else self._clock.time_of(end))
             # The two moments of the increments, with the gains for a gap of this length.
             if self.moving_model.reads:
                 self.state = self.algorithm.update(self.state, Increments(moments, gap))
             self._now = end
 
-    def _read(self, start: float, end: float) -> FloatArray:
-        """Return the moments (2 p,) of the increments of all sensors in [start, end]."""
-        truth = self._truth
+    def _read(self, end: float) -> FloatArray:
+        """Return the moments (2 p,) of the increments of all sensors since those before, up to
+        ``end`` (s); time by a clock is a multiple of time, which does not change them.
+        """
+        truth, start, self._read_to = self._truth, self._read_to, end
         x_moments = truth.moments(start, end)
         parts = [sensor.moments(truth, x_moments, start, end) for sensor in self._increments]
         # Stack the sensors: first moments of all rows, then the second ones.
