@@ -47,6 +47,12 @@ class Chain(NamedTuple):
     deliver_bad: float
 
     @property
+    def mean_delivery(self) -> float:
+        """The fraction of messages that arrive in the long run."""
+        good, bad = self.to_good * self.deliver_good, self.to_bad * self.deliver_bad
+        return (good + bad) / (self.to_bad + self.to_good)
+
+    @property
     def lost_twice(self) -> float:
         """Probability that two consecutive messages are lost, in the stationary chain."""
         start = np.array([self.to_good, self.to_bad]) / (self.to_bad + self.to_good)

@@ -34,6 +34,10 @@ from netkf.linalg.arrays import FloatArray
 
 WINDOWS, MAX_WINDOWED = 8, 600
 """Windows of a run in which ticks and losses are counted, up to so many clocks or directions."""
+SHARES = np.append(np.sort(np.arange(1, WINDOWS) * 0.6180339887498949 % 1.0), 1.0)
+"""Shares of a run in which ticks are counted too: ticks in groups that are as long as a part of the
+run look like single ones in equal windows.
+"""
 FIRST_TICK, SPREAD = 1.0, 2.0
 """Slack, in ticks of one run, for the transient of a renewal clock that starts with the run; and
 safety factor on the dispersion index of its counts, which replaces c^2 of an unknown gap law.
@@ -76,12 +80,14 @@ class TickCounts(NamedTuple):
     cells    : (CELLS, 2) numbers of ranks of gaps in equal parts of [0, 1), and of those looked at
     products : (3,) sums over neighbouring gaps (:func:`correlate_neighbours`)
     off      : () largest distance in seconds of a tick from the times of a deterministic clock
+    path     : (S, E) ticks in each of the first SHARES of the run, of many clocks only in all of it
     """
 
     ticks: np.ndarray
     cells: FloatArray
     products: FloatArray
     off: FloatArray
+    path: np.ndarray
 
 
 class TickSeries(NamedTuple):
@@ -115,6 +121,10 @@ def count_ticks(
     """Return the counts of the ticks at ``times`` (K,) of the clocks ``owners`` (K,) of a group."""
     size = len(group.entities)
     windows = count_by_window(times, owners, size, horizon)
+    shares = SHARES if size <= MAX_WINDOWED else SHARES[-1:]
+    part = np.searchsorted(shares[:-1], times / horizon, side="right")
+    in_parts = np.bincount(part * size + owners, minlength=len(shares) * size)
+    path = np.cumsum(in_parts.reshape(-1, size), axis=0)
     # After its last tick each clock has a gap that the run does not finish.
     times = np.concatenate([times, np.full(size, np.inf)])
     owners = np.concatenate([owners, np.arange(size)])
@@ -135,7 +145,7 @@ def count_ticks(
             begin, gaps = ticks.before * rates, (ticks.times - ticks.before) * rates
             ranks.rank[rows], ranks.known[rows] = censored_ranks(law, begin, gaps, horizon * rates)
     products = correlate_neighbours(ranks, number == 0)
-    return TickCounts(windows, count_ranks(ranks), products, np.array(off))
+    return TickCounts(windows, count_ranks(ranks), products, np.array(off), path)
 
 
 def _lattice_ranks(law: Lattice, ticks: TickSeries, horizon: float) -> FloatArray:
@@ -180,16 +190,16 @@ def _distance_from_lattice(law: Lattice, ticks: TickSeries) -> float:
     return float(max(spread.max() - law.jitter, early.max(), excess.max(), 0.0))
 
 
-def slack_of_start(group: ClockGroup, counts: np.ndarray, windows: np.ndarray) -> FloatArray:
+def slack_of_start(group: ClockGroup, counts: np.ndarray, paths: np.ndarray) -> FloatArray:
     """Return by how many ticks (E,) mean counts in a run of T seconds may differ from rate T though
     the rate is right: a renewal process has between rate T - 1 and rate T + c^2, c the coefficient
     of variation of its gaps (Lorden 1970). An unknown c^2 is the dispersion index of ``counts`` (R,
-    E), or, where ticks come in groups, how far means of ``windows`` (R, W, E) stray from a line.
+    E), or, where ticks come in groups, how far means of ``paths`` (R, S, E) stray from a line.
     """
     from_counts = SPREAD * counts.var(axis=0, ddof=1) / np.maximum(counts.mean(axis=0), 1e-300)
-    path = np.cumsum(windows.mean(axis=0), axis=0)
-    shares = np.arange(1, len(path) + 1)[:, None] / len(path)
-    unknown = np.maximum(from_counts, SPREAD * np.ptp(path - shares * path[-1], axis=0))
+    path = paths.mean(axis=0)
+    strays = path - SHARES[-len(path) :, None] * path[-1]
+    unknown = np.maximum(from_counts, SPREAD * np.ptp(strays, axis=0))
     slack = np.where(np.isnan(group.spreads), unknown, group.spreads)
     return np.asarray(np.maximum(slack, FIRST_TICK))
 

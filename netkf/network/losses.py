@@ -146,9 +146,11 @@ class Loss(Component):
     def mean_delivery(self, sent: Transmission) -> float:
         """Return the fraction of messages that arrive in the long run on the link of ``sent``, its
         message 0 at time 0, for theory and summaries; nan if it is unknown before a run. By default
-        the delivery probability of that message, nan if those of others differ, or the class draws
-        states or ``conditions``.
+        that of the ``chain``, if the class states one, else the delivery probability of that
+        message, nan if those of others differ, or the class draws states or ``conditions``.
         """
+        if self.chain is not None:
+            return self.chain.mean_delivery
         if self.stateful or has_conditions(self):
             return math.nan
         return float(self.delivery_probability(sent))

@@ -256,7 +256,7 @@ def _check_rates(
     watched: WatchedPart, group: ClockGroup, counts: TickCounts, unknown: np.ndarray, horizon: float
 ) -> None:
     ticks, distances, level = counts.ticks.sum(axis=1), [], 0.5 * family_level()
-    slack = slack_of_start(group, ticks, counts.ticks)
+    slack = slack_of_start(group, ticks, counts.path)
     if not unknown.any():
         distances = rates_of_all(group, counts.ticks, float(slack.sum()), horizon, level)
     if not unknown.any() or len(unknown) > 1:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy
 
+from netkf.algorithms.filter import Filter
 from netkf.algorithms.traits import Timing
 from netkf.engines.simpy.engine import SimpyEngine
 from netkf.linalg.arrays import FloatArray, square_root
@@ -17,6 +18,7 @@ from netkf.network.channels import Channel
 from netkf.network.clocks import LinkClock, OnReadings, Periodic
 from netkf.network.delays import Delay
 from netkf.network.graphs import Complete
+from netkf.network.lives import Life
 from netkf.network.losses import Transmission
 from netkf.network.matchings import Broadcast, Matching, SlotActivation
 from netkf.plants.diffusion import Diffusion
@@ -150,8 +152,7 @@ def run(
     """Run a filter on a complete network of 2 or 3 nodes, node 1 without a sensor; return estimates
     and run. ``shifted`` shifts truth and states on the way, ``spread`` is between first estimates.
     """
-    timing, n = watched.part.timing, len(system.M)
-    tick = 1.0 if kind.slots else INCREMENT_TICK if kind.increments else SAMPLE_TICK
+    timing, n, tick = watched.part.timing, len(system.M), tick_of(kind)
     A = system.M - np.eye(n)
 
     def transition(seconds: float) -> FloatArray:
@@ -169,26 +170,41 @@ def run(
         spread=spread,
         composes=not kind.slots and kind.clock in (None, *timing.clocks[:1]),
     )
-    weights = observed.link_weights
+    scenario = small_scenario(observed, system, kind, Channel(delay=_delay(kind, timing, tick)))
+    return observed.log.seen, simulate(scenario, engine=SimpyEngine())
+
+
+def tick_of(kind: Kind) -> float:
+    """Return the seconds between slots, or ticks of a clock."""
+    return 1.0 if kind.slots else INCREMENT_TICK if kind.increments else SAMPLE_TICK
+
+
+def small_scenario(
+    algorithm: Filter, system: System, kind: Kind, channel: Channel, lives: tuple[Life, ...] = ()
+) -> Scenario:
+    """Return a scenario of a filter on a complete network of 2 or 3 nodes, node 1 without a
+    sensor.
+    """
+    weights, tick = algorithm.link_weights, tick_of(kind)
     count = 3 if weights.largest_degree >= 2.0 else 2
     count = count if weights.matrix is None else len(weights.matrix)
     start: Any = {"mean": system.mean, "cov": system.cov}
-    scenario = Scenario(
+    return Scenario(
         name="check_filter",
         horizon=tick * (kind.slots or TICKS),
         plant=LinearPlant(F=system.M, Q=system.Q, period=1.0, **start)
         if kind.slots
-        else Diffusion(A=A, B=square_root(system.Q), **start),
+        else Diffusion(A=system.M - np.eye(len(system.M)), B=square_root(system.Q), **start),
         sensors=_sensors(system, kind, count),
         network=Network(
             graph=Complete(nodes=count),
-            activation=_activation(kind, timing, tick),
-            channel=Channel(delay=_delay(kind, timing, tick)),
+            activation=_activation(kind, algorithm.timing, tick),
+            channel=channel,
+            lives=lives,
         ),
-        filter=Filtering(algorithm=observed),
+        filter=Filtering(algorithm=algorithm),
         probe=tick,
     )
-    return observed.log.seen, simulate(scenario, engine=SimpyEngine())
 
 
 def _sensors(system: System, kind: Kind, count: int) -> tuple[LinearSensor, ...]:

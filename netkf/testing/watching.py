@@ -318,9 +318,14 @@ class WatchedPart:
 
     def repeat(self, method: str, draw: Callable[[RecordingGenerator], Any]) -> Any:
         """Return what ``draw`` makes of a generator, which must be the same of an equal one."""
-        first, second = (draw(RecordingGenerator(5)) for _ in range(2))
+        generators = [RecordingGenerator(5) for _ in range(2)]
+        first, second = map(draw, generators)
         path = differing_path(collect_leaves(first), collect_leaves(second))
         self.demand(method, path is None, OWN_GENERATOR, "another result from an equal generator")
+        calls = [random.take_calls() for random in generators]
+        got = " and then ".join(map(describe_calls, calls))
+        remedy = "keep nothing of an earlier run"
+        self.demand(method, calls[0] == calls[1], "must draw the same in each run", got, remedy)
         return first
 
     def pickle_copy(self) -> Any:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from netkf.core.laws import Chain
 from netkf.network.clocks import LinkClock, Periodic, Poisson, Renewal
 from netkf.network.delays import ConstantDelay, Delay, ExponentialDelay
 from netkf.network.losses import Bernoulli, GilbertElliott, Loss
@@ -233,6 +234,33 @@ class Late(LinkClock):
 
 
 NUMBERS = {}
+
+
+@says(CHANNELS, "SameWeather.conditions: must draw the same in each run; got 9 x exp")
+class SameWeather(Loss):
+    """The weather of the first run is that of all."""
+
+    def conditions(self, random, horizon):
+        if "weather" not in NUMBERS:
+            NUMBERS["weather"] = np.cumsum(random.exponential(horizon / 5.0, 9))
+        return NUMBERS["weather"]
+
+    def delivery_probability(self, sent):
+        return 0.5 + 0.5 * (np.searchsorted(sent.conditions, sent.time) % 2)
+
+
+@says(CHANNELS, "OtherChain.mean_delivery: must be the delivered fraction")
+class OtherChain(Loss):
+    """Makes other steps than it states, and states nothing else."""
+
+    stateful = True
+    chain = Chain(to_bad=0.1, to_good=0.5, deliver_good=1.0, deliver_bad=0.2)
+
+    def next_state(self, link, bad, random):
+        return bool(random.random() < 0.3)
+
+    def delivery_probability(self, sent):
+        return 0.2 if sent.bad else 1.0
 
 
 @says(CHANNELS, "OneWorse.delivery_probability: must be the same for links with eq", delivery=0.8)

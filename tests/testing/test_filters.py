@@ -7,6 +7,7 @@ import pytest
 from netkf import parts
 from netkf.algorithms.filter import commutes
 from netkf.core.contracts import require_known_members
+from netkf.kernels import Kernels, kernel, load, store
 from netkf.testing import check_filter
 from tests.conftest import with_slow
 from tests.testing.broken_filters import BROKEN
@@ -114,6 +115,27 @@ def test_every_breach_is_named(name):
     assert words in text
     assert "\n" not in text
     assert text.startswith(name)
+
+
+@kernel
+def absorb_all(record, h, run):
+    """Forget that in some of the runs side by side a message has not arrived."""
+    for k in range(run.count):
+        for i in range(len(run.size)):
+            heard = load(run.lanes, record.payload.xhat, run.message[k], i)
+            store(run.lanes, record.xhat, h, i, heard)
+
+
+@dataclass(frozen=True, eq=False)
+class Hasty(parts.Filter):
+    timing = parts.Timing(clocks=())
+    kernels = Kernels(absorb=absorb_all)
+
+
+def test_kernels_that_mix_runs_are_told():
+    """A single run was right, and so was all of SimPy: ensembles were wrong."""
+    with pytest.raises(AssertionError, match=r"Hasty.kernels: must give each run what it has alo"):
+        check_filter(Hasty())
 
 
 def test_what_is_no_filter_is_told():

@@ -105,13 +105,14 @@ def _number_drawn(group: ClockGroup, horizon: float, runs: float) -> int:
 
 def _check_rates(clocks: JudgedClocks, samples: PartSamples, level: float) -> Finding:
     scenario, group = samples.scenario, clocks.group(samples.scenario)
-    windows, horizon = getattr(samples, clocks.field).ticks, scenario.horizon
+    found, horizon = getattr(samples, clocks.field), scenario.horizon
+    windows = found.ticks
     counts, runs = windows.sum(axis=1), len(windows)
     further = _number_drawn(group, horizon, runs)
     if further:
         drawn = _drawn_counts(clocks, scenario, samples.seed, runs, further)
         counts = np.concatenate([counts, drawn])
-    slack = ticks.slack_of_start(group, counts, windows)
+    slack = ticks.slack_of_start(group, counts, found.path)
 
     def sample_factor(factor: float) -> float:
         """Return the factor on the number of counts of a clock for a factor on the runs."""
