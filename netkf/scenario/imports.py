@@ -110,8 +110,8 @@ def _offers(path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
 def _loaded_class(entry: EntryPoint) -> Any:
     try:
         return attrgetter(entry.attr)(sys.modules[entry.module])
-    # Not loaded, or no "package.module:Class"; importlib_metadata, where loaded, has a ValueError.
-    except (AttributeError, KeyError, TypeError, ValueError):
+    # Not loaded, or no "package.module:Class", which is one of four errors, by the version.
+    except (AttributeError, KeyError, TypeError, ValueError, AssertionError):
         return None
 
 
