@@ -123,14 +123,14 @@ class Ages:
     def _grow(self, count: int) -> None:
         """Make room for ``count`` more messages under way."""
         columns = self._columns
-        first, free = len(columns["number"]), columns["free"]
+        first = len(columns["number"])
         for name in ("held", "number", "sender", "following"):
             old = columns[name]
             columns[name] = np.concatenate([old, np.zeros((count, *old.shape[1:]), old.dtype)])
+        # None of the others is free, or they would do.
         columns["free"] = np.zeros(first + count + 1, dtype=np.int64)
-        columns["free"][: free[-1]] = free[: free[-1]]
-        columns["free"][free[-1] : free[-1] + count] = np.arange(first, first + count)
-        columns["free"][-1] = free[-1] + count
+        columns["free"][:count] = np.arange(first, first + count)
+        columns["free"][-1] = count
         self._state = AgeState(**columns)
 
     def add(self, rows: np.ndarray) -> None:

@@ -133,6 +133,16 @@ def test_fresh_links_fail_anew_in_each_step_and_held_ones_once_a_slot(planar):
         assert share == pytest.approx(0.7, abs=0.04)
 
 
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_hearers_that_share_a_fate_hold_it_for_all_steps_of_a_slot(planar, engine):
+    loss = {"kind": "shared", "delivery": 0.7, "share": 1.0}
+    changes = {"filter.links": "held", "network.channel.loss": loss, "horizon": 5.0}
+    scenario = planar.replace({**changes, "network.channel.symmetric": False})
+    found = fates(netkf.simulate(scenario, engine=engine), scenario, symmetric=False)
+    for slot in range(1, 20):
+        assert found[slot, 1, 0] == found[slot, 1, 1] == found[slot, 1, 2] != found[slot, 0, 0]
+
+
 def test_the_record_of_a_run_gives_the_run_again(planar, tmp_path):
     run = netkf.simulate(planar)
     rows = ["slot,phase,step,node,peer"]

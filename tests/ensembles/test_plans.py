@@ -248,6 +248,8 @@ def test_other_versions_are_refused_and_other_machines_only_mixed_if_asked(
         error = capsys.readouterr().err
         assert "numpy 99.0 instead of" in error
         assert len(error.splitlines()) == 1
+    # Of what is merged nothing is computed again.
+    assert plans.open_plan(mixed).is_merged
 
 
 def test_what_is_no_plan_is_refused_in_one_line(plan, tmp_path, capsys):

@@ -1,5 +1,6 @@
 """Worker processes: one that dies at any moment is replaced, an interrupt waits for none."""
 
+import importlib
 import os
 import signal
 import subprocess
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import netkf
-from netkf.ensembles.blocks import Job
+from netkf.ensembles.blocks import Job, pack_scenario
 from netkf.ensembles.pools import PoolOptions, ProcessPool
 from netkf.ensembles.replicas import replicate
 from tests.conftest import SCENARIOS
@@ -126,3 +127,20 @@ def group_exists(number):
     except ProcessLookupError:
         return False
     return True
+
+
+@pytest.mark.parametrize("module", ["own_losses", "own_losses.inner"])
+def test_workers_find_packages_in_the_folder_above_the_outermost(
+    ring, module, tmp_path, monkeypatch
+):
+    package = tmp_path / "own_losses"
+    package.mkdir()
+    text = "import netkf.parts\n\nclass Mine(netkf.parts.Bernoulli):\n    pass\n"
+    for name in ("__init__.py", "inner.py"):
+        (package / name).write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    mine = importlib.import_module(module).Mine(delivery=0.5)
+    packed = pack_scenario(ring.replace({"network.channel.loss": mine}))
+    assert packed.modules == ((module, str(tmp_path)),)
+    for name in ("own_losses", "own_losses.inner"):
+        sys.modules.pop(name, None)

@@ -76,6 +76,15 @@ def test_delays_have_their_law(delay, law):
     assert together.tolist() == [delay.draw(other) for _ in range(9)]
 
 
+def test_what_never_arrives_does_not_by_any_number():
+    never, always = (channels.Channel(loss=losses.Bernoulli(p)) for p in (0.0, 1.0))
+    sent = losses.Transmission((0, 1))
+    for uniform in (0.0, 0.5, 1.0 - 2.0**-53):
+        draw = channels.ChannelDraw(uniform, False, 0.25)
+        assert np.isnan(channels.transit_time(never, sent, draw))
+        assert channels.transit_time(always, sent, draw) == 0.25
+
+
 def directions(run):
     """Whether the two messages of each tick arrived, (ticks, 2)."""
     log = run.log

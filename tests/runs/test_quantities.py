@@ -405,6 +405,31 @@ def test_slots_without_a_row_bring_no_reading(tmp_path):
     assert network(from_table(table, tmp_path))["worst_age"][1] == 5.0
 
 
+def test_what_a_node_had_heard_when_it_went_down_is_lost(tmp_path):
+    """Node 1 hears one message of node 0, in the slot in which it goes down, and all of node 2."""
+    rows = [f"{i},{j},{k},{int((i, j, k) == (0, 1, 2) or i == 2)}\n"
+            for i, j in ((0, 1), (1, 0), (1, 2), (2, 1)) for k in range(9)]  # fmt: skip
+    (tmp_path / "losses.csv").write_text("sender,receiver,message,delivered\n" + "".join(rows))
+    (tmp_path / "lives.csv").write_text("t,node,what\n3.1,1,down\n3.2,1,up\n")
+    table = {
+        "format": 1, "name": "lost", "horizon": 8.0, "probe": 1.0,
+        "sensors": [{"nodes": [0], "H": [[1.0]], "R": [[1.0]]}],
+        "plant": {"kind": "linear", "F": [[0.9]], "Q": [[1.0]], "period": 1.0, "cov": [[1.0]]},
+        "network": {
+            "graph": {"kind": "path", "nodes": 3},
+            "activation": {"kind": "broadcast", "phase": 0.3},
+            "channel": {"loss": {"kind": "recorded", "path": "losses.csv"}, "symmetric": False},
+            "lives": [{"kind": "recorded", "nodes": [1], "path": "lives.csv"}],
+        },
+        "filter": {"kind": "kcf", "epsilon": 0.1},
+    }  # fmt: skip
+    scenario = from_table(table, tmp_path)
+    log = netkf.simulate(scenario, 1, engine="simpy").log
+    heard = log[(log["kind"] == CODES["deliver"]) & (log["peer"] == 0)]
+    assert heard["t"].tolist() == [3.0]
+    assert network(scenario)["worst_age"][1] == 8.0
+
+
 def test_one_sample_that_is_nan_leaves_nothing_of_its_node_and_of_all(ring):
     squares = np.ones((4, len(ring.nodes)))
     squares[2, 1] = np.nan

@@ -10,6 +10,7 @@ import pytest
 
 import netkf
 from netkf.trace import recorder
+from netkf.trace.nees import blurred_from, errors, traces
 from netkf.trace.recorder import MemorySink
 from netkf.trace.schema import EVENT, EVENT_COLUMNS, state_columns
 
@@ -42,6 +43,29 @@ def test_tables_have_their_columns(ring):
     np.testing.assert_allclose(row.nees, e @ np.linalg.inv(run.P[7, 4]) @ e)
     assert run.P[7, 4, 0, 1] == row.P01
     assert "P0_11" in state_columns(12)
+
+
+def test_states_that_a_node_does_not_estimate_do_not_count_and_others_that_are_nan_do():
+    nan, P = np.nan, np.array([[2.0, 0.0, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, np.nan]])
+    P[2, :2] = P[:2, 2] = nan
+    e = np.array([[2.0, 1.0, nan], [2.0, nan, nan], [nan, nan, nan]])
+    square, nees = errors(e, np.stack([P, P, np.full((3, 3), nan)]))
+    np.testing.assert_array_equal(square, [5.0, nan, nan])
+    np.testing.assert_allclose(nees, [4.0, nan, nan], rtol=1e-15)
+    np.testing.assert_array_equal(traces(np.stack([P, np.full((3, 3), nan)])), [2.5, nan])
+
+
+def test_errors_are_blurred_from_where_rounding_shows():
+    """A standard deviation below a hundred times the rounding of the state; one of 0 never is."""
+    times, eps = np.arange(4.0), 4.0 * np.finfo(float).eps
+    x = np.array([1.0, 1e3, 1e6, 1e9])[None, :, None]
+    P = np.full((1, 4, 2, 1, 1), 4.0)
+    P[:, :, 0] = (200.0 * eps * 1e6) ** 2
+    e, lengths = np.ones((1, 4, 2, 1)), np.array([4])
+    assert blurred_from(times, x, P, e, lengths).tolist() == [3.0]
+    P[:, :, 0] = (99.0 * eps * 1e6) ** 2
+    assert blurred_from(times, x, P, e, lengths).tolist() == [2.0]
+    assert blurred_from(times, x, 0.0 * P, e, lengths).tolist() == [np.inf]
 
 
 def test_columns_that_mean_nothing_say_so(ring):
