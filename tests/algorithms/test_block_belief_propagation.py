@@ -5,11 +5,13 @@ plain solution for all states of all nodes together.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import netkf
+from netkf.algorithms.block_belief_propagation import BlockBeliefPropagation
 from netkf.scenario.reading import from_table
 from netkf.trace.schema import KINDS
 from tests.algorithms.test_block_intersection import BELIEF, CLOCKED, ROBOTS, load
@@ -150,6 +152,39 @@ def test_p_is_right_where_nodes_forget_and_too_small_on_loops(tmp_path: Path, te
     np.testing.assert_allclose(shares[0], 1.0, rtol=1e-9)
     assert shares[1].min() > 1.0 - 1e-9
     assert shares[1].max() > 1.05
+
+
+def test_who_is_read_and_reads_nobody_uses_it_at_that_instant(tmp_path: Path) -> None:
+    text = CLOCKED.replace('kind = "relative"', 'kind = "relative"\nto = [[1, 2]]')
+    keys = {"filter": BELIEF | {"estimates": "own"}, "plants__0__nodes": [1, 2]}
+    graph = {"network__graph": {"kind": "edges", "edges": [[1, 2]]}}
+    run = netkf.simulate(load(text, tmp_path, horizon=0.75, probe=0.5, **keys, **graph))
+    P = np.exp(-0.1) + 0.25 * (1.0 - np.exp(-0.1)) / 0.2
+    np.testing.assert_allclose(run.P[1, 1], 1.0 / (1.0 / P + 1.0 / (P + 0.3)), rtol=1e-12)
+
+
+def test_no_message_makes_p_larger_though_windows_are_short(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found, absorb = list[float](), BlockBeliefPropagation.absorb
+
+    def watched(self: Any, state: Any, *arguments: Any) -> Any:
+        after = absorb(self, state, *arguments)
+        found.append(after.uncertainty / state.uncertainty)
+        return after
+
+    monkeypatch.setattr(BlockBeliefPropagation, "absorb", watched)
+    # Most messages bring no reading of an instant that windows reach.
+    clock = {"kind": "poisson", "rate": 5.0, "at": "nodes"}
+    keys = {"filter": BELIEF | {"estimates": "own", "window": 2}, "network__activation": clock}
+    netkf.simulate(load(CLOCKED, tmp_path, **keys))
+    assert len(found) > 30
+    assert max(found) < 1.0 + 1e-8
+
+
+def test_a_message_has_two_means_and_a_triangle(tmp_path: Path) -> None:
+    scenario = load(ROBOTS, tmp_path, filter=BELIEF | {"estimates": "own", "window": 4})
+    assert scenario.message_size(1, -1) == 8.0 * (4 + 4 + 10)
 
 
 @pytest.mark.slow

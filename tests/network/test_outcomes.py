@@ -199,6 +199,20 @@ def test_a_note_says_that_nothing_is_shared(scenario_of):
     assert ["no fate is shared" in " ".join(notes) for notes in told] == [True, False]
 
 
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_who_shares_a_fate_hears_nothing_over_a_link_that_is_down(scenario_of, tmp_path, engine):
+    rows = [(slot, i, j) for slot in range(1, 9) for i, j in ((0, 1), (2, 3)) if slot % 3]
+    lines = [f"{slot},0,0,{i},{j}" for slot, *pair in rows for i, j in (pair, pair[::-1])]
+    (tmp_path / "up.csv").write_text("\n".join(["slot,phase,step,node,peer", *lines]))
+    channel = 'symmetric = false, loss = { kind = "shared", delivery = 1.0, share = 1.0 }'
+    scenario = scenario_of(SLOTS, channel, horizon=9.0)
+    changes = {"network.activation": {"kind": "recorded", "path": "up.csv"}}
+    log = netkf.simulate(scenario.replace(changes), engine=engine).log
+    heard = log[log["kind"] == CODES["deliver"]]
+    found = zip(heard["t"].tolist(), heard["peer"].tolist(), heard["node"].tolist(), strict=True)
+    assert {(t, i, j) for t, i, j in found if i < j} == set(rows)
+
+
 def test_a_shared_chain_is_one_state_for_all_hearers(scenario_of):
     loss = (
         'loss = { kind = "gilbert-elliott", mean_loss = 0.4, mean_burst = 5.0, shared = true }, '

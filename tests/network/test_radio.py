@@ -157,6 +157,27 @@ def test_both_engines_wait_alike(scenario_of, at, radio):
 
 
 @pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_each_exchange_of_a_slot_has_messages_of_its_own_size(scenario_of, engine):
+    plant = {"kind": "linear", "F": [[0.9]], "Q": [[1.0]], "period": 10.0, "cov": [[1.0]]}
+    changes = {
+        "plant": plant,
+        "sensors": [{"nodes": [0, 1], "H": [[1.0]], "R": [[0.1]]}],
+        "network.activation": {"kind": "broadcast"},
+        "filter": {"kind": "diffusion-kalman"},
+    }
+    scenario = scenario_of("bits_per_second = 1280.0, frame_bytes = 8", 200.0).replace(changes)
+    log, frames = netkf.simulate(scenario, engine=engine).log, set()
+    for phase in (0, 1):
+        size = scenario.message_size(0, phase)
+        ages = log["age"][(log["kind"] == CODES["deliver"]) & (log["phase"] == phase)]
+        np.testing.assert_allclose(ages, 8.0 * size / 1280.0, atol=1e-9)
+        frames.add(Radio(frame_bytes=8).frames(size))
+    assert len(frames) == 2
+    lossy = {"network.channel.loss": {"kind": "bernoulli", "delivery": 0.7}}
+    assert_agree(scenario.replace(lossy))
+
+
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
 def test_a_radio_is_free_at_the_instant_at_which_a_message_ends(scenario_of, engine):
     clock = {"kind": "periodic", "period": 0.1, "at": "nodes"}
     scenario = scenario_of('bits_per_second = 1280.0, queue = "drop"', 40.0)
