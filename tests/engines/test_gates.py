@@ -307,6 +307,19 @@ def test_messages_that_are_late_and_nodes_that_are_down(scenario_of):
     assert min(run.count(kind) for kind in ("refuse", "crash", "late")) > 3
 
 
+@pytest.mark.parametrize("low", [0.0, 0.1])
+def test_readings_in_messages_that_took_time_pass(scenario_of, low):
+    text = network_of("clocks", "gossip").replace(LOSS, LATE if low else "")
+    text = text.replace("low = 0.0", "low = 0.1").replace(
+        'kind = "gossip"', 'kind = "intermittent"'
+    )
+    text = text.replace('kind = "poisson", rate = 1.0', 'kind = "readings"')
+    log = netkf.simulate(scenario_of(text, "probability = 0.9", 15.0), engine="simpy").log
+    peers = log["peer"][log["kind"] == CODES["refuse"]]
+    assert (peers == -1).sum() > 3
+    assert (peers >= 0).any() == (low == 0.0)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("then", ["ignore", "inflate"])
 @pytest.mark.parametrize("name", ["range_tracking", "formation"])

@@ -181,6 +181,29 @@ def test_what_arrives_after_the_inbox_closed_is_late_and_lost(tmp_path):
         np.testing.assert_allclose(run.P[k + 1, 1], expected, rtol=1e-12)
 
 
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_what_comes_while_a_later_exchange_is_open_is_late(tmp_path, engine):
+    """Node 1 hears node 0 after 0.1 s and node 2 after 0.2 s, and is heard a slot later."""
+    delays = {(0, 1): 0.1, (2, 1): 0.2, (1, 0): 1.1, (1, 2): 1.2}
+    rows = [f"{i},{j},{k},{t}" for (i, j), t in delays.items() for k in range(9)]
+    (tmp_path / "delays.csv").write_text("\n".join(["sender,receiver,message,seconds", *rows]))
+    network = {
+        "graph": {"kind": "path", "nodes": 3},
+        "activation": {"kind": "broadcast", "phase": 0.3},
+        "channel": {"delay": {"kind": "recorded", "path": "delays.csv"}, "symmetric": False},
+    }
+    sensors = [{"nodes": [0, 1, 2], "H": [[1.0]], "R": [[1.0]]}]
+    scenario = slotted(tmp_path, 8, [[0.9]], [[1.0]], [[1.0]], sensors, network, "kcf")
+    events = netkf.simulate(scenario, engine=engine).events
+    came = events[events.kind.isin(["deliver", "late"])]
+    assert {
+        (k, i, round(t % 1.0, 9)) for k, i, t in zip(came.kind, came.node, came.t, strict=True)
+    } == {("deliver", 1, 0.1), ("deliver", 1, 0.2), ("late", 0, 0.1), ("late", 2, 0.2)}
+    absorbed = events[events.kind == "absorb"]
+    assert set(absorbed.node) == {1}
+    np.testing.assert_allclose(absorbed.age, 0.2)
+
+
 @pytest.mark.parametrize("slots", [3, 6, 7, 12])
 def test_a_horizon_that_is_a_product_of_floats_has_no_slot_too_many(slots, tmp_path):
     """3 * 0.1 is 0.30000000000000004: slot 3 begins at the horizon, not before."""

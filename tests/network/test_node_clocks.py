@@ -202,6 +202,18 @@ def test_rows_of_tables_are_of_local_times(scenario_of, tmp_path, engine):
         np.testing.assert_allclose(t, (shown - OFFSET[node]) / (1.0 + DRIFT[node]), atol=1e-12)
 
 
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_a_node_that_forgets_begins_again_at_the_time_of_its_clock(scenario_of, engine):
+    """Between its going up and its next reading P is the prior, predicted by its clock."""
+    life = {"nodes": [1], "kind": "duty", "period": 4.0, "up": 2.1, "phase": 3.0, "memory": "lost"}
+    scenario = scenario_of(filter_="local").replace({"network.lives": [life], "probe": [3.25]})
+    run = netkf.simulate(scenario, engine=engine)
+    x, P = predict(np.array([0.5, 0.0]), np.array([[1.0, 0.2], [0.2, 2.0]]), 0.25 * (1 + DRIFT[1]))
+    assert not any(3.0 <= t <= 3.25 for t in local_lattice(1, 0.5, 6.0))
+    np.testing.assert_allclose(run.xhat[0, 1], x, atol=1e-12)
+    np.testing.assert_allclose(run.P[0, 1], P, atol=1e-12)
+
+
 def test_contacts_are_of_no_clock_of_a_node(scenario_of, tmp_path):
     (tmp_path / "contacts.csv").write_text("from,until,node,peer\n1,3,0,1\n2,5,1,0\n")
     contacts = {"kind": "contacts", "path": "contacts.csv", "at": "directions"}
