@@ -13,7 +13,7 @@ import scipy.linalg
 import netkf
 from netkf.algorithms.filter import Exchange, Message, Reading
 from netkf.trace.schema import CODES
-from tests.algorithms.test_block_intersection import KEPT, ROBOTS, TWO, load
+from tests.algorithms.test_block_intersection import CLOCKED, KEPT, ROBOTS, TWO, load
 
 # Two blocks of two states that move differently; the first node knows more than the second.
 F_1, F_2 = np.array([[1.0, 0.3], [0.0, 0.9]]), np.array([[0.8, 0.1], [-0.2, 1.0]])
@@ -179,6 +179,39 @@ def test_factors_that_cannot_be_inverted_are_not_used(tmp_path: Path) -> None:
         np.testing.assert_allclose(after.P, 0.5)
         assert (after.last.item(), after.when.item()) == (1.0, 1.0)
     assert (filtering.absorb(lost, [], at).base == 0.0).all()
+
+
+@pytest.mark.parametrize("steps", [1, 8])
+def test_covariances_turn_with_the_coordinates(tmp_path: Path, steps: int) -> None:
+    """Also where a node hears several at once, which moves what it has told them."""
+    T, found = np.array([[1.0, 2.0], [-0.5, 0.3]]), []
+    F, Q, C = np.array([[0.9, 0.3], [-0.1, 0.8]]), np.diag([0.2, 0.1]), np.array([[1, 0.2], [0, 1]])
+    for turn in (np.eye(2), T):
+        back = np.linalg.inv(turn)
+        cov, noise, moved = turn @ turn.T, turn @ Q @ turn.T, turn @ F @ back
+        text = ROBOTS.replace("cov = [[1.0]]", f"cov = {cov.tolist()}")
+        text = text.replace("[[0.9]]", str(moved.tolist())).replace("[[0.2]]", str(noise.tolist()))
+        text = text.replace("H = [[1.0]]", f"H = {[back[0].tolist()]}")
+        pair = f"H = {(C @ back).tolist()}\nR = [[0.3, 0.0], [0.0, 0.4]]"
+        text = text.replace("R = [[0.3]]", pair)
+        keys = {"filter": KEPT | {"estimates": "own", "steps": steps}}
+        found.append(netkf.simulate(load(text, tmp_path, **keys)).P)
+    np.testing.assert_allclose(found[1], T @ found[0] @ T.T, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("filtering", [KEPT, {"kind": "block-intersection"}])
+def test_readings_of_pairs_that_took_time_are_not_used(
+    tmp_path: Path, filtering: dict[str, object]
+) -> None:
+    late = {"delay": {"kind": "constant", "seconds": 0.1}}
+    lost = {"loss": {"kind": "bernoulli", "delivery": 0.0}}
+    keys = {"filter": filtering | {"estimates": "own"}}
+    run, alone = (
+        netkf.simulate(load(CLOCKED, tmp_path, network__channel=channel, **keys))
+        for channel in (late, lost)
+    )
+    assert run.count("absorb") > 20
+    np.testing.assert_allclose(run.P, alone.P, rtol=1e-10)
 
 
 def test_links_that_go_one_way_are_refused(tmp_path: Path) -> None:
