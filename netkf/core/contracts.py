@@ -71,16 +71,20 @@ def source_line(code: CodeType, line: int | None = None) -> str:
     return f"{file if relative.startswith('..') else relative}, line {line}"
 
 
-def error_line(error: BaseException) -> str:
+def error_line(error: BaseException, package: str = "") -> str:
     """Return "file, line n" of the deepest call in a user's file that led to an error, "" if there
-    is none: neither netkf's files count, nor those of installed packages and of Python.
+    is none: neither netkf's files count, nor those of Python and of installed packages, except the
+    ``package`` of the user's class.
     """
     ours, python = str(Path(__file__).parents[1]), os.path.dirname(os.__file__)
     places = [
         source_line(frame.f_code, line)
         for frame, line in traceback.walk_tb(error.__traceback__)
-        if not frame.f_code.co_filename.startswith(("<", ours, python))
-        and "site-packages" not in frame.f_code.co_filename
+        if frame.f_globals.get("__name__", "").partition(".")[0] == package
+        or (
+            not frame.f_code.co_filename.startswith(("<", ours, python))
+            and "site-packages" not in frame.f_code.co_filename
+        )
     ]
     return places[-1] if places else ""
 

@@ -68,7 +68,7 @@ def find_class(kind: str, origin: Origin) -> Any:
         unload_namesake(module_name, origin.folder)
         return getattr(importlib.import_module(module_name), class_name)
 
-    return _load(kind, load, path)
+    return _load(kind, load, path, module_name)
 
 
 def find_offered_class(kind: str, origin: Origin) -> Any:
@@ -89,7 +89,7 @@ def find_offered_class(kind: str, origin: Origin) -> Any:
         raise _import_error(kind, ImportError("another module of that name is loaded"))
     if not origin.imports and _loaded_class(entry) is None:
         return None
-    return _load(kind, entry.load, list(path))
+    return _load(kind, entry.load, list(path), entry.value)
 
 
 def offered_kinds(cls: type | None = None) -> list[str]:
@@ -125,12 +125,12 @@ def _is_loaded_from_elsewhere(entry: EntryPoint, path: list[str]) -> bool:
     return Path(file or "").resolve() != Path(spec.origin).resolve()
 
 
-def _load(kind: str, load: Callable[[], Any], path: list[str]) -> Any:
+def _load(kind: str, load: Callable[[], Any], path: list[str], target: str) -> Any:
     with _replace_import_path(path):
         try:
             return load()
         except (Exception, SystemExit) as error:
-            raise _import_error(kind, error) from None
+            raise _import_error(kind, error, target) from None
 
 
 @contextmanager
@@ -143,14 +143,15 @@ def _replace_import_path(entries: list[str]) -> Iterator[None]:
         sys.path[:] = [*(entry for entry in sys.path if entry not in entries), *before]
 
 
-def _import_error(kind: str, error: BaseException) -> ScenarioError:
+def _import_error(kind: str, error: BaseException, target: str = "") -> ScenarioError:
     if isinstance(error, ContractError):
         return ScenarioError("kind", str(error), kind, "write what the contract asks for")
     rule = f"could not be imported ({type(error).__name__}: {quote(str(error), 300)})"
     is_missing = isinstance(error, ModuleNotFoundError) and error.name == kind.partition(":")[0]
     remedy = "put the module beside the scenario file or on the Python path"
     if not is_missing:
-        place = error_line(error)
+        module = target.partition(":")[0].strip()
+        place = error_line(error, module.partition(".")[0]) or module
         remedy = f"correct the module, {place}" if place else "correct the module"
     return ScenarioError("kind", rule, kind, remedy)
 

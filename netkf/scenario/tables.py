@@ -253,7 +253,7 @@ def _construct(cls: type[Any], values: dict[str, Any]) -> Any:
         raise
     except Exception as error:
         # The user's class is this one, or one of the values, whose methods a check called.
-        place = error_line(error)
+        place = error_line(error, cls.__module__.partition(".")[0])
         where = f"; {place}" if place else ""
         rule = f"{cls.__name__} could not be made ({describe_error(error)}{where})"
         if isinstance(error, ContractError):

@@ -1,5 +1,6 @@
 """A scenario of a stranger executes nothing; see docs/security.md."""
 
+import importlib
 import os
 import pickle
 import shutil
@@ -232,6 +233,24 @@ def test_a_package_offers_classes_as_kinds(folder, site, monkeypatch, capsys):
     assert type(again.filter.algorithm).__module__ == "good.deep"
     assert again.network.channel.loss.delivery == 0.5
     assert main(["compare-filters", str(file), "--filters", "hybrid,my-hybrid"]) == 0
+
+
+def test_mistakes_of_an_installed_package_are_named_with_its_file(folder, site):
+    offer(site, "poor", fails="poor:P", lacks="poor.deep:Absent", unmade="poor.deep:P")
+    (site / "poor").mkdir()
+    (site / "poor" / "deep.py").write_text(
+        "from netkf.parts import Hybrid\n\n\nclass P(Hybrid):\n"
+        "    def __post_init__(self):\n        raise RuntimeError('no')\n"
+    )
+    (site / "poor" / "__init__.py").write_text("")
+    for kind, words in (("lacks", r"module, poor\.deep"), ("unmade", r"no; .*deep\.py, line 6\)")):
+        with pytest.raises(netkf.ScenarioError, match=words):
+            netkf.load(scenario(folder, kind))
+    sys.modules.pop("poor"), sys.modules.pop("poor.deep")
+    (site / "poor" / "__init__.py").write_text("\n1 / 0\n")
+    importlib.invalidate_caches()
+    with pytest.raises(netkf.ScenarioError, match=r"correct the module, .*__init__\.py, line 2$"):
+        netkf.load(scenario(folder, "fails"))
 
 
 def test_nothing_is_imported_to_find_out_what_packages_offer(folder, site, capsys, monkeypatch):
