@@ -217,8 +217,7 @@ def split_at(outcomes: LogOutcomes, edges: FloatArray) -> LogOutcomes:
         window = np.searchsorted(edges, group.t, side="right")
         for k in np.unique(window):
             own = np.flatnonzero(window == k)
-            follows = group.follows[own] & (np.arange(len(own)) > 0)
-            groups.append(Group(group.x[own], group.t[own], follows, group.links))
+            groups.append(Group(group.x[own], group.t[own], group.follows[own], group.links))
             channels.append(channel)
     return LogOutcomes(outcomes.links, tuple(groups), tuple(channels))
 
@@ -421,7 +420,7 @@ def shared_law(outcomes: LogOutcomes, delivery: float, share: float) -> tuple[fl
         n, k = np.isfinite(group.x).sum(axis=1), np.nansum(group.x, axis=1)
         alone = delivery**k * (1.0 - delivery) ** (n - k)
         one = np.where(k == n, delivery, 0.0) + np.where(k == 0, 1.0 - delivery, 0.0)
-        mixed = np.where(n > 1, (1.0 - share) * alone + share * one, alone)
+        mixed = (1.0 - share) * alone + share * one
         likelihood += float(np.log(np.maximum(mixed, 1e-300)).sum())
         spread += float(((k - n * delivery) ** 2).sum())
     return likelihood, spread / float(outcomes.counts[:, 0].sum()) ** 2

@@ -2,15 +2,18 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jsonschema
 import numpy as np
 import pytest
 
 import netkf
-from netkf.algorithms.stochastic_trigger import ScheduledReadings
+from netkf.algorithms.filter import Exchange, Reading
+from netkf.algorithms.stochastic_trigger import ScheduledReadings, TriggeredMessages
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import load, store
+from netkf.scenario.reading import from_table
 from netkf.scenario.schema import scenario_schema
 from netkf.scenario.writing import as_table, to_toml
 from netkf.trace.schema import CODES
@@ -337,3 +340,43 @@ def test_filters_within_filters_are_written_as_they_are_read(table, tmp_path):
     (tmp_path / "again.toml").write_text(to_toml(as_table(scenario)))
     assert netkf.load(tmp_path / "again.toml").filter == scenario.filter
     assert scenario.replace({"filter": table}).filter == scenario.filter
+
+
+def test_after_its_first_reading_a_node_sends_whatever_it_has_told_before():
+    """A filter in plain Python: without a reading a node tells what it knows."""
+    inner = SimpleNamespace(
+        init=lambda *_: None,
+        update=lambda state, _: state,
+        emit=lambda state, _: (state, "told"),
+        estimate=lambda _: (np.zeros(1), np.eye(1)),
+    )
+    triggered, told = TriggeredMessages(1.0, inner), []
+    state = triggered.init(None, np.zeros(1), np.eye(1), None)
+    for reads in (False, True, True):
+        if reads:
+            reading = Reading(np.array([0.1]), np.eye(1), np.eye(1), 1.0)
+            state = triggered.update(state, reading)
+        state, payload = triggered.emit(state, Exchange(1.0, uniform=0.0))
+        told.append(payload)
+    assert told == ["told", "told", None]
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_rows_of_one_record_are_there_together(several, tmp_path):
+    """A matrix Y weighs all rows of a node, of which those of one of two records may be missing."""
+    (tmp_path / "y.csv").write_text("t,node,y0,y1\n1,0,0.5,0.1\n2,0,0.3,0.2\n")
+    one = {"kind": "recorded", "nodes": [0], "path": "y.csv", "R": [[1.0, 0.0], [0.0, 1.0]]}
+    sensors = [{**one, "H": [[1.0, 0.0], [0.0, 1.0]]}] * (1 + several)
+    table = {
+        "format": 1, "name": "rows", "horizon": 4.0, "probe": 1.0, "sensors": sensors,
+        "plant": {"kind": "unknown", "F": [[0.9, 0.0], [0.1, 0.8]], "period": 1.0,
+                  "Q": [[1.0, 0.0], [0.0, 1.0]], "cov": [[1.0, 0.0], [0.0, 1.0]]},
+        "network": {"graph": {"kind": "path", "nodes": 2}, "activation": {"kind": "broadcast"}},
+        "filter": {"kind": "event-triggered", "trigger": "stochastic", "inner": {"kind": "kcf"},
+                   "Y": np.eye(2 + 2 * several).tolist()},
+    }  # fmt: skip
+    if not several:
+        assert netkf.simulate(from_table(table, tmp_path), engine="simpy").count("send")
+        return
+    with pytest.raises(netkf.ScenarioError, match="because some rows of the readings of node 0"):
+        from_table(table, tmp_path)
