@@ -300,6 +300,9 @@ def test_what_nobody_reported_counts_as_lost_and_holes_do_not(tmp_path):
     unknown = pd.read_csv(tmp_path / "out" / "unknown.csv")
     assert fit.links["unreported"].sum() == len(unknown) > 100
     assert fit.links["unknown"].sum() == 0
+    heard, packets = fit.links["heard"], fit.links["packets"]
+    np.testing.assert_allclose(fit.links["at_least"], heard / packets)
+    np.testing.assert_allclose(fit.links["at_most"], (heard + fit.links["unreported"]) / packets)
     assert (fit.links["low"] < 0.6).all()
     assert (fit.links["high"] > 0.6).all()
     assert fit.tests.set_index("key").loc["fate", "verdict"] == "not rejected"

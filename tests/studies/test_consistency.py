@@ -9,6 +9,7 @@ import pytest
 import scipy.stats
 
 import netkf
+from netkf.checks.innovations import compute_innovations
 from netkf.cli.main import main
 from netkf.core.errors import ScenarioError
 from netkf.rng.streams import Streams
@@ -31,6 +32,38 @@ from tests.conftest import SCENARIOS
 
 NO_REASON = np.array([""])
 GOSSIP = str(SCENARIOS / "gossip_ring.toml")
+
+
+@pytest.mark.parametrize(
+    "model",
+    [{}, {"F": [[0.7, 0.1], [0.1, 0.9]]}, {"input": False}, {"schedule": False}],
+    ids=lambda model: "-".join(model) or "right",
+)
+@pytest.mark.parametrize("kind", ["local", "intermittent"])
+def test_nis_is_that_of_the_innovations_of_the_filter(kind, model):
+    """From samples, also where filters believe in another plant: as the filter itself has them."""
+    sine = {"kind": "sine", "G": [[1.0], [0.5]], "amplitude": 2.0, "frequency": 0.1}
+    plant = {
+        "kind": "linear", "period": 1.0, "F": [[0.9, 0.3], [0.0, 0.8]],
+        "Q": [[0.2, 0.0], [0.0, 0.3]], "mean": [2.0, -1.0], "cov": [[1.0, 0.0], [0.0, 1.0]],
+        "input": sine, "schedule": [{"from": 5.0, "F": [[0.5, 0.3], [0.2, 0.8]]}],
+    }  # fmt: skip
+    table = {
+        "format": 1, "name": "innovations", "horizon": 12.0, "probe": 1.0, "plant": plant,
+        "sensors": [{"nodes": [0], "H": [[1.0, 0.5]], "R": [[0.4]]}],
+        "network": {"graph": {"kind": "path", "nodes": 2}, "activation": {"kind": "broadcast"}},
+        "filter": {"kind": kind, "model": model},
+    }  # fmt: skip
+    if kind == "local":
+        table["network"].pop("activation")
+    scenario = from_table(table, Path())
+    found = replica_consistency(scenario, 3, 0, "simpy").nis[0]
+    # A sample at 12 s has the innovation of a slot that the shorter run does not begin.
+    run = netkf.simulate(scenario.replace({"horizon": 13.0}), 3, engine="simpy")
+    given = compute_innovations(run)
+    own = given.nis[(given.nodes == 0) & (given.times > 0.0) & (given.times <= 12.0)]
+    assert len(own) == 12
+    assert found == pytest.approx(own.mean(), rel=1e-9)
 
 
 @pytest.fixture

@@ -16,6 +16,8 @@ from netkf.checks.innovations import Innovations
 from netkf.cli.main import main
 from netkf.scenario.reading import from_table
 from netkf.studies.innovation_tests import (
+    Stretch,
+    _ends_of,
     find_stretch,
     format_innovations,
     judge_innovations,
@@ -128,6 +130,12 @@ def test_what_is_stated_as_detectable_is_found(walk):
             broken(judge_innovations(walk, drawn(random, change=change), 0.99)) for _ in range(20)
         ]
         assert sum(2 in nodes for nodes in found) >= 14  # 18 are expected; fewer in one of 500
+
+
+def test_a_stretch_lasts_from_its_first_reading_to_its_last():
+    times = np.array([0.5, 1.0, 2.0, 3.0, 5.0])
+    assert _ends_of(Stretch(1, 4, 0.0), times) == (1.0, 3.0)
+    assert np.isnan(_ends_of(Stretch(0, 5, 0.0), times)).all()
 
 
 @pytest.mark.parametrize("kind", ["noise", "offset"])

@@ -170,6 +170,21 @@ def test_a_variance_that_readings_deny_is_zero(tmp_path):
     assert zero[0].scenario.filter.model.Q[0, 0] == 0.0
 
 
+def test_what_no_reading_depends_on_stays_as_it_is_and_noise_that_a_table_has_too(tmp_path):
+    """Readings of the first state, each with the variance that its row says, and none after 3 s."""
+    rows = [f"{k},0,{y:g},{0.5 + 0.1 * k:g}" for k, y in enumerate((0.3, -1.0, 0.8, 1.7), 1)]
+    (tmp_path / "y.csv").write_text("\n".join(["t,node,y0,R0", *rows]))
+    plant = {
+        "kind": "unknown", "F": [[1.0, 0.0], [0.0, 0.9]], "Q": [[500.0, 0.0], [0.0, 0.7]],
+        "period": 1.0, "cov": [[1.0, 0.0], [0.0, 1.0]],
+    }  # fmt: skip
+    sensor = {"kind": "recorded", "path": "y.csv", "H": [[1.0, 0.0]]}
+    table = fit_noise(scenario(tmp_path, plant, sensor, 6.0)).table.set_index("name")
+    assert list(table.index) == ["Q[0][0]", "Q[1][1]"]
+    assert table.loc["Q[1][1]", "value"] == 0.7
+    assert np.isnan(table.loc["Q[1][1]", "se"])
+
+
 def test_blocks_of_one_name_share_a_variance(tmp_path):
     plants = [
         {"name": "walk", "nodes": [0, 1], "kind": "diffusion", "A": [[0.0]], "B": [[0.5]]},

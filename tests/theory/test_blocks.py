@@ -209,6 +209,21 @@ def test_blocks_that_change_and_whose_input_is_not_known(
     np.testing.assert_allclose(error_covariance(exact, run), run.P, rtol=1e-9)
 
 
+def test_of_several_messages_that_arrive_at_once_the_newest_counts(tmp_path: Path) -> None:
+    # Those sent at 0.5, 1.0 and 1.5 all arrive at 1.5, and so on.
+    rows = [f"{i},{j},{k},{1.0 - 0.5 * (k % 3):g}" for i, j in ((1, 2), (2, 1), (2, 3), (3, 2))
+            for k in range(24)]  # fmt: skip
+    (tmp_path / "d.csv").write_text("\n".join(["sender,receiver,message,seconds", *rows]))
+    scenario = load(
+        CLOCKED, tmp_path, filter__estimates="own+neighbours",
+        network__channel={"delay": {"kind": "recorded", "path": "d.csv"}, "symmetric": False},
+        network__activation={"kind": "periodic", "period": 0.5, "at": "nodes"},
+    )  # fmt: skip
+    run = netkf.simulate(scenario, engine="simpy")
+    known = np.isfinite(run.P)
+    np.testing.assert_allclose(error_law(scenario, run).P[known], run.P[known], rtol=1e-9)
+
+
 @pytest.mark.parametrize("rule", ["split", "ci"])
 def test_a_reading_that_several_nodes_use_makes_their_errors_dependent(
     tmp_path: Path, rule: str
