@@ -16,6 +16,7 @@ from netkf.core.errors import ScenarioError
 from netkf.network.deliveries import Deliveries, MessageKey
 from netkf.network.losses import Transmission
 from netkf.scenario.reading import from_table
+from netkf.studies.explanation import InformationSource, Missing, WhatIf, Why
 from netkf.studies.information import (
     OUTCOMES,
     KeptReadings,
@@ -623,3 +624,25 @@ def test_what_a_node_heard_before_it_went_down_is_not_used_after(build, tmp_path
     messages = match_messages(log, swaps=False, slotted=True)
     sent = messages.sent[messages.outcome == OUTCOMES.index("unused")]
     assert sent.tolist() == [1.0]
+
+
+def test_sentences_tell_of_each_source_what_its_row_says():
+    """Node 1 asked about: itself, two neighbours with sensors, and node 4 two links away."""
+    nan, lost = math.nan, Missing(4, 2, 7, "lost", 5.0, math.nan)
+    rows = [
+        (1, True, False, nan, nan, 0, 10.0, 9.5, (1,), (9.5, 9.5, 9.5), 9.5, ()),
+        (2, True, True, 7.0, 7.5, 2, 7.0, 6.5, (2, 1), (6.5, 6.5, 6.5), 9.0, ()),
+        (3, True, True, 9.0, 9.0, 0, 9.0, 8.5, (3, 1), (8.5, 8.5, 8.5), 9.0, ()),
+        (4, True, False, nan, nan, 5, 4.0, 3.0, (4, 2, 1), (3.0, 5.0, 6.0), 8.0, (lost, lost)),
+    ]
+    sources = tuple(InformationSource(*row) for row in rows)
+    why = Why("hand", 1, 10.0, 0, 0, sources, (WhatIf("as it was", (), 2.0, 0.5),), None, {})
+    told = " ".join(why.sentences())
+    assert "It last heard node 3 at 9 s (1 s before) and node 2 at 7 s (3 s before)" in told
+    # Of neighbours alone it is known what was sent to it.
+    assert "2 messages sent to it since then were lost, late or not used: 2 of node 2." in told
+    readings = "7 s old from node 4 (4 -> 2 -> 1), 3.5 s old from node 2 (2 -> 1) and 1.5 s old"
+    assert f"Its newest readings are {readings} from node 3 (3 -> 1)." in told
+    # With two more messages: the second of those with one, two and three.
+    assert "A newer reading of node 4, 5 s old, would have come with" in told
+    assert "old from node 1" not in told
