@@ -7,6 +7,7 @@ on disk, so that the next process starts at once; numba itself is imported with 
 from __future__ import annotations
 
 import atexit
+import dis
 import gc
 import hashlib
 import os
@@ -193,8 +194,10 @@ class Kernel:
 
     def compile_entry(self, arguments: tuple[Any, ...], returns_number: bool) -> int:
         """Return the address of a C function for ``arguments`` of these types, which returns a
-        float or nothing (``addresses``); compile it, or load it from disk.
+        float or nothing (``addresses``); compile it, or load it from disk. Raises TypeError for a
+        user's function that raises: C has no exceptions, and a run would go on with what is there.
         """
+        _require_no_raise(self._loops, set())
         numba = require_numba()
         returned = numba.types.float64 if returns_number else numba.types.void
         kinds = tuple(map(numba.typeof, arguments))
@@ -217,6 +220,22 @@ class Kernel:
     def _known_options(self) -> dict[str, Any]:
         """Return the options that this numba has."""
         return {name: self._options[name] for name in self._options.keys() - _unknown_options()}
+
+
+def _require_no_raise(loops: Callable[..., Any], seen: set[Any]) -> None:
+    """Raise TypeError if a user's function, or a kernel that it calls, raises an exception."""
+    code, names = loops.__code__, loops.__globals__
+    if loops in seen or str(names.get("__name__")).partition(".")[0] == "netkf":
+        return
+    seen.add(loops)
+    for step in dis.get_instructions(code):
+        if step.opname == "RAISE_VARARGS":
+            lines = (line for begin, end, line in code.co_lines() if begin <= step.offset < end)
+            where = f"{code.co_filename}, line {next(lines, code.co_firstlineno)}"
+            raise TypeError(f"a kernel must not raise ({where}): write nan, which ends the run")
+    for callee in map(names.get, code.co_names):
+        if isinstance(callee, Kernel):
+            _require_no_raise(callee.loops, seen)
 
 
 def _make_kernel(

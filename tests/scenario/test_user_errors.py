@@ -397,6 +397,30 @@ class Mute(parts.Filter):
     kernels = Kernels(emit=mute)
 
 
+@kernel
+def positive(x):
+    assert x > 0.0
+    return x
+
+
+@kernel
+def raising(record, h, run):
+    record.xhat[h, 0, 0] = positive(record.xhat[h, 0, 0])
+
+
+class Raising(parts.Filter):
+    kernels = Kernels(absorb=raising)
+
+
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_a_kernel_that_raises_is_refused(ring, engine):
+    """The exception was ignored, and the run went on to its end."""
+    with pytest.raises(
+        netkf.EngineError, match=r"a kernel must not raise \(.*errors.py, line \d+\)"
+    ):
+        netkf.simulate(ring.replace({"filter": Raising()}), engine=engine)
+
+
 def test_a_kernel_that_is_silent_without_saying_so_is_told():
     """SimPy sent nothing, and the compiled engine did not ask."""
     with pytest.raises(AssertionError, match=r"run.sends: write Kernels\(decides=True\)"):
