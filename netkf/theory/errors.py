@@ -62,9 +62,9 @@ def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> Flo
     filters that are not affine and for those whose verbs are plain Python, also where a user's
     subclass overrides one.
     """
-    joint = _joint_moments(scenario, run, about_mean=True)
     if not stacked:
-        return _estimated_blocks(scenario, joint)
+        return _estimated_blocks(scenario, run, about_mean=True)
+    joint = _moments(scenario, run, about_mean=True, stacked=True)
     if scenario.views is None:
         return joint
     known = scenario.is_estimated.ravel()
@@ -75,7 +75,7 @@ def error_squares(scenario: Scenario, run: Run) -> FloatArray:
     """Return E[(x - xhat_i)(x - xhat_i)'] (T, N, n, n) given the events: :func:`error_covariance`
     and the square of the mean error. Raises its errors.
     """
-    return _estimated_blocks(scenario, _joint_moments(scenario, run, about_mean=False))
+    return _estimated_blocks(scenario, run, about_mean=False)
 
 
 @IGNORED
@@ -98,22 +98,21 @@ def diagonal_blocks(stacked: FloatArray, nodes: int) -> FloatArray:
     return np.ascontiguousarray(np.einsum("tiaib->tiab", blocks))
 
 
-def _estimated_blocks(scenario: Scenario, joint: FloatArray) -> FloatArray:
-    """Return the blocks (T, N, n, n), nan beyond the states of a node, of joint (T, N n, N n)."""
-    known = scenario.is_estimated
-    blocks = diagonal_blocks(joint, len(scenario.nodes))
+def _estimated_blocks(scenario: Scenario, run: Run, about_mean: bool) -> FloatArray:
+    """Return moments (T, N, n, n) of each node's error, nan beyond the states that it has."""
+    known, blocks = scenario.is_estimated, _moments(scenario, run, about_mean, stacked=False)
     return np.where(known[:, :, None] & known[:, None, :], blocks, np.nan)
 
 
 @IGNORED
-def _joint_moments(scenario: Scenario, run: Run, about_mean: bool) -> FloatArray:
+def _moments(scenario: Scenario, run: Run, about_mean: bool, stacked: bool) -> FloatArray:
+    """Return ``ErrorColumns.moments`` of all nodes at each of ``run.times``."""
     errors = _errors_of(scenario, run)
     # The generator stops at each sample, when the errors have their values of that time.
-    joint = errors.covariance if about_mean else errors.second_moments
-    moments, size = [joint() for _ in errors.replay()], errors.estimators * errors.n
+    moments = np.array([errors.moments(about_mean, stacked) for _ in errors.replay()])
     # A pooled filter is replayed once; all nodes share its estimate, and so its error.
     copies = len(scenario.nodes) // errors.estimators
-    return np.tile(np.array(moments).reshape(-1, size, size), (1, copies, copies))
+    return np.tile(moments, (1, copies, copies) if stacked else (1, copies, 1, 1))
 
 
 def _errors_of(scenario: Scenario, run: Run) -> ErrorColumns:

@@ -63,15 +63,14 @@ class ErrorColumns:
         """Store the present errors for ``law``."""
         self._kept.append(self._forms())
 
-    def covariance(self) -> FloatArray:
-        """Return the joint covariance (M n, M n) of the errors of the estimators."""
-        noises = self._forms()[:, 1:]
-        return np.asarray(noises @ noises.T)
-
-    def second_moments(self) -> FloatArray:
-        """Return the joint second moments (M n, M n): covariances and products of means."""
-        forms = self._forms()
-        return np.asarray(forms @ forms.T)
+    def moments(self, about_mean: bool, stacked: bool) -> FloatArray:
+        """Return E[e e'] of the error of each estimator (M, n, n), or ``stacked`` of all together
+        (M n, M n); ``about_mean`` their covariances.
+        """
+        forms = self._forms()[:, int(about_mean) :]
+        if not stacked:
+            forms = forms.reshape(self.estimators, self.n, -1)
+        return np.asarray(forms @ np.swapaxes(forms, -1, -2))
 
     def law(self) -> tuple[FloatArray, FloatArray]:
         """Return the mean (K M n,) and the covariance of the errors at the K times of ``keep``."""
