@@ -108,7 +108,8 @@ class NodeTime(NamedTuple):
         """
         shown = self.grid.snap(ticks + (ahead + self.offset))
         times = self.grid.snap((shown - self.offset) / self.pace)
-        return np.asarray(times[times > 0.0])
+        # A row of a table may be at 0; others come after it.
+        return times[times > 0.0] if ahead < 0.0 else times
 
 
 def node_time(scenario: Any, streams: Any, node: int) -> NodeTime:
