@@ -152,7 +152,7 @@ class Kernels:
     observe : ``observe(record, h, run)`` is called where a sample is taken
     interval : ``interval(record, h, run)``, the seconds of increments that ``update`` may use at
                once from this state on
-    decides : ``emit`` may write 0 into ``run.sends``
+    decides : ``emit`` may write 0 into ``run.sends`` at a node that others hear
     sends_readings : a message brings the sender's reading of that instant, ``run.heard``
     remembers : the record has a ``past``
     counts_sends : ``emit`` changes the record, so that it is called even if no message arrives

@@ -407,8 +407,6 @@ KERNELS = Kernels(
     shift=shift,
     shift_payload=shift_payload,
     observe=observe,
-    decides=True,
-    depends_on_data=False,
     counts_sends=True,
     unrolled=True,
 )

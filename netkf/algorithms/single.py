@@ -398,7 +398,7 @@ def emit(state: NodeState, exchange: Any) -> tuple[NodeState, Payload | None]:
     if exchange.slot >= 0 and not surroundings.sends(exchange.phase, has_reading):
         return new, None
     if not run.sends[0]:
-        if not state.kernels.decides:
+        if not state.kernels.decides and (exchange.slot >= 0 or exchange.receivers):
             raise ContractError("emit writes 0 into run.sends: write Kernels(decides=True)")
         return new, None
     fields = {name: getattr(payload, name) for name in cls.struct_fields}

@@ -218,7 +218,6 @@ def _slowest_mixing(mixing: SparseOrFull) -> float:
 
 
 @lru_cache(maxsize=8)
-@lru_cache(maxsize=4)  # with their cached bound
 def _with_faster_links(scenario: Scenario, factor: float) -> Scenario:
     clock = scenario.network.activation
     if not isinstance(clock, (Poisson, Renewal)) or clock.rate is None:

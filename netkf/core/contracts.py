@@ -77,10 +77,11 @@ def error_line(error: BaseException, package: str = "") -> str:
     ``package`` of the user's class.
     """
     ours, python = str(Path(__file__).parents[1]), os.path.dirname(os.__file__)
+    packages = {package} - {"", "netkf"}
     places = [
         source_line(frame.f_code, line)
         for frame, line in traceback.walk_tb(error.__traceback__)
-        if frame.f_globals.get("__name__", "").partition(".")[0] == package
+        if str(frame.f_globals.get("__name__")).partition(".")[0] in packages
         or (
             not frame.f_code.co_filename.startswith(("<", ours, python))
             and "site-packages" not in frame.f_code.co_filename

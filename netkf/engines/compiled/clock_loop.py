@@ -378,7 +378,7 @@ def send_all(
     if arrives and verbs.addressed == 0:
         clear_payload(state.quantiser, m)
         call_at_two(verbs.emit, record, h, m, run)
-    if verbs.decides == 1 and run.sends[0] == 0:
+    if run.sends[0] == 0:
         release(state, m)
         return
     if becomes != NONE_SENT:

@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import compiled_kernels
-from netkf.algorithms.running_sums import KERNELS as PUSH_SUM
 from netkf.engines.compiled.moving_links import MovingLinks
 from netkf.engines.compiled.senders import Senders
 from netkf.linalg.arrays import FloatArray, IntArray
@@ -353,8 +352,7 @@ def message_delays(
 def unknown_outcomes(scenario: Scenario) -> str | None:
     """Return which outcomes ticks alone do not tell, since nodes may be silent at them; or None."""
     kernels = None if scenario.slotted else compiled_kernels(scenario.node_filter, clocked=True)
-    # A node of push-sum is silent only where nobody hears it.
-    if kernels is None or not kernels.decides or kernels is PUSH_SUM:
+    if kernels is None or not kernels.decides:
         return None
     channel = scenario.network.channel
     follows_time = type(channel.loss) in (GilbertElliott, ScheduledLoss)
