@@ -72,6 +72,8 @@ class LinearVerbs:
         with_means = ClockFilters(scenario, kernels, start, messages)
         self.clocked, self.run, self._p = with_means, with_means.run, max(1, rows)
         self.messages = len(self.run.message)
+        # All records and runs are of one class.
+        self._addresses: dict[Any, int] = {}
         pooled = scenario.node_filter.timing.pooled
         records = make_records(
             scenario.node_filter,
@@ -311,6 +313,11 @@ class LinearVerbs:
         words, places = self.message_words(m), self._offset_places
         self._apply(self.kernels.shift_payload, words, m, 0.0, places=places, others=offset)
 
+    def _address(self, verb: Any, integers: int = 1) -> int:
+        if verb not in self._addresses:
+            self._addresses[verb] = address_of(verb, self._record, self.run, integers)
+        return self._addresses[verb]
+
     def _apply(
         self,
         verb: Any,
@@ -328,9 +335,8 @@ class LinearVerbs:
         # The first ``keep`` words may change, or all; the last ``written`` are only written.
         # The verb depends on further numbers, whose forms are ``others`` (k, C): ``places`` (k, 2)
         # say row i of reading r, or entry i of the offset for r = -1. With ``m`` it is ``emit``.
-        predict, act = address_of(self.kernels.predict, self._record, self.run), NOTHING
-        if verb is not None:
-            act = address_of(verb, self._record, self.run, 1 if m < 0 else 2)
+        predict = self._address(self.kernels.predict)
+        act = NOTHING if verb is None else self._address(verb, 1 if m < 0 else 2)
         kept, forms, rows = words[:keep], self.forms, self._row[words]
         # Block 0 is as things are without noise; in each other one 1 is added to one number.
         inputs = np.flatnonzero(rows[: len(words) - written] >= 0)
