@@ -25,9 +25,11 @@ def _run(options: argparse.Namespace) -> int:
     # horizon; ``--set`` may have changed it.
     scenario = load_scenario(options, {"probe": [0.0]})
     if options.runs is None:
-        from netkf.checks.check import usual_runs
+        from netkf.checks.check import USUAL_RUNS, usual_runs
 
         options.runs = usual_runs(scenario)
+        if options.runs < USUAL_RUNS:
+            print_notes([f"{options.runs} runs, of {len(scenario.nodes):,} nodes; see --runs"])
     with lock_directory(options.out):
         return _check(scenario, options)
 

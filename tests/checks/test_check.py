@@ -8,6 +8,7 @@ import netkf
 from netkf.checks import exact, statistics
 from netkf.checks.check import check, judge_replicas, run_replica, usual_runs, with_check_times
 from netkf.checks.evidence import BROKEN, HOLDS, NOT_PROMISED
+from netkf.cli.main import main
 from netkf.core.errors import TheoryError
 from netkf.laws import intervals
 from netkf.scenario.reading import from_table
@@ -432,6 +433,9 @@ def test_larger_networks_take_fewer_runs(nodes, runs, tmp_path):
     assert usual_runs(from_table({**GOSSIP, "network": network}, tmp_path)) == runs
 
 
-def test_runs_that_are_not_given_are_the_usual_ones(tmp_path, monkeypatch):
+def test_runs_that_are_not_given_are_the_usual_ones(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("netkf.checks.check.USUAL_RUNS", 11)
     assert check(from_table(GOSSIP, tmp_path), workers=1).runs == 11
+    monkeypatch.setattr("netkf.checks.check.usual_runs", lambda scenario: 10)
+    assert main(["check", str(SCENARIOS / "gossip_ring.toml"), "--workers", "1"]) == 0
+    assert "note: 10 runs, of 5 nodes; see --runs" in capsys.readouterr().err
