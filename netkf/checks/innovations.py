@@ -26,7 +26,7 @@ from netkf.core.errors import NetkfError
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
-from netkf.theory.numerics.prediction import NODES, WEIGHTS, ShortExponential
+from netkf.theory.numerics.prediction import StateFlow
 from netkf.trace.run import Run, first_difference
 
 LOG_2PI = math.log(2.0 * math.pi)
@@ -116,7 +116,8 @@ class ExpectedIncrements:
         self._n, self._H, self._R = n, model.H, model.R
         # The joint equation of (x, z): dx = A x ds + dw and dz = x ds.
         A = np.block([[model.A, np.zeros((n, n))], [np.eye(n), np.zeros((n, n))]])
-        self._exponential, self._root = ShortExponential(A), square_root(model.Q)
+        B = np.concatenate([square_root(model.Q), np.zeros((n, n))])
+        self._equation = StateFlow(A, B)
 
     def innovation(
         self, xhat: FloatArray, P: FloatArray, y: FloatArray, gap: float
@@ -126,11 +127,9 @@ class ExpectedIncrements:
         """
         n, H = self._n, self._H
         # Transition F of (x, z) over the gap, and its noise covariance Q, from a short part of it.
-        doublings = max(0, math.ceil(math.log2(gap / self._exponential.unit)))
-        part = gap / 2.0**doublings
-        E = self._exponential(np.append(NODES, 1.0) * part)
-        F, responses = E[-1], E[:-1, :, :n] @ self._root
-        Q = np.tensordot(responses, (WEIGHTS * part)[:, None, None] * responses, ((0, 2), (0, 2)))
+        doublings = max(0, math.ceil(math.log2(gap / self._equation.unit)))
+        F, response = self._equation(gap / 2.0**doublings)
+        Q = response @ response.T
         for _ in range(doublings):
             F, Q = F @ F, Q + F @ Q @ F.T
         J = F[n:, :n]  # integral of exp(A s) over the gap, so that E[z] = J xhat

@@ -115,7 +115,7 @@ def _narrowed(factor: FloatArray) -> FloatArray:
 
 
 class StateFlow:
-    """The true state dx = A x dt + B dw over gaps; A is (n, n), B (n, m).
+    """The true state dx = A x dt + B dw over gaps of at most ``unit`` seconds; A (n, n), B (n, m).
 
     inputs : 8 m, the m of the noise at each of 8 quadrature nodes (instants of the gap)
     """
@@ -123,6 +123,7 @@ class StateFlow:
     def __init__(self, A: FloatArray, B: FloatArray) -> None:
         """Take A (n, n), per second, and B (n, m) of m noises of variance 1 per second."""
         self._exp, self._B = ShortExponential(A), B
+        self.unit = self._exp.unit
         self.inputs = len(NODES) * B.shape[1]
 
     def __call__(self, gap: float) -> tuple[FloatArray, FloatArray]:
