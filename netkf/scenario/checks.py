@@ -238,31 +238,28 @@ def _pauses_increments(scenario: DerivedScenario) -> bool:
     return (kernels is None or kernels.is_kalman) and not algorithm.timing.pooled
 
 
-def _check_owners(scenario: DerivedScenario, name: str, entries: Sequence[Any]) -> None:
-    """Raise ScenarioError unless nodes are in one each of ``entries``, and nodes with lives take
-    samples where the filter cannot go without increments for a time.
-    """
-    needs_samples = name == "lives" and not _pauses_increments(scenario)
+def _check_owners(name: str, entries: Sequence[Any]) -> None:
+    """Raise ScenarioError unless nodes are in one each of ``entries``."""
     owners: dict[int, int] = {}
     for k, entry in enumerate(entries):
         for node in entry.nodes:
-            key = f"network.{name}[{k}].nodes"
             if owners.setdefault(node, k) != k:
                 rule = f"must not have a node of network.{name}[{owners[node]}]"
-                raise ScenarioError(key, rule, node, "give each node one entry")
-            if needs_samples and node in scenario.increment_sensors:
-                rule = "cannot have a node whose sensors give increments, only one where they "
-                rule += f"sample, with the {filter_name(scenario)}"
-                remedy = 'write sampling = { kind = "periodic", period = ... } in its [[sensors]]'
-                raise ScenarioError(key, rule, node, remedy)
-    if owners and name == "clocks" and scenario.node_filter.timing.pooled:
-        rule = f"has no meaning for the {filter_name(scenario)}, which is in no node"
-        raise ScenarioError(f"network.{name}", rule, sorted(owners), "remove it")
+                raise ScenarioError(
+                    f"network.{name}[{k}].nodes", rule, node, "give each node one entry"
+                )
 
 
 def _check_lives(scenario: DerivedScenario) -> None:
     lives = scenario.network.lives
-    _check_owners(scenario, "lives", lives)
+    _check_owners("lives", lives)
+    for k, life in enumerate(() if _pauses_increments(scenario) else lives):
+        for node in life.nodes:
+            if node in scenario.increment_sensors:
+                rule = "cannot have a node whose sensors give increments, only one where they "
+                rule += f"sample, with the {filter_name(scenario)}"
+                remedy = 'write sampling = { kind = "periodic", period = ... } in its [[sensors]]'
+                raise ScenarioError(f"network.lives[{k}].nodes", rule, node, remedy)
     lost = [k for k, life in enumerate(lives) if life.memory == "lost"]
     if not lost:
         return
@@ -295,11 +292,13 @@ def _check_shared_states(scenario: DerivedScenario) -> None:
 
 def _check_clocks(scenario: DerivedScenario) -> None:
     clocks, why = scenario.network.clocks, None
-    _check_owners(scenario, "clocks", clocks)
+    _check_owners("clocks", clocks)
     nodes = [node for entry in clocks for node in entry.nodes]
     sensors, placed, remedy = scenario.sensors, scenario.placed_sensors, "remove it"
     recorded = [i for i in nodes if any(sensors[p.entry].record for p in placed.get(i, ()))]
-    if scenario.slotted:
+    if scenario.node_filter.timing.pooled:
+        why = f"has no meaning for the {filter_name(scenario)}, which is in no node"
+    elif scenario.slotted:
         why = "belongs to continuous time: slots begin for all nodes at once"
     elif recorded:
         why, nodes = "cannot be of nodes whose readings are recorded, with their stamps", recorded
