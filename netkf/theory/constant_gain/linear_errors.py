@@ -14,7 +14,6 @@ from netkf.network.clocks import LinkClock, Periodic
 from netkf.network.matchings import Broadcast
 from netkf.plants.transitions import Transitions
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.delayed_jumps import DelayedJumps
 from netkf.theory.common.jumps import ClockJumps, SlotJumps
 from netkf.theory.common.random_links import Directions, directions_of, poisson_ticks
 from netkf.theory.hybrid.samples import sampling_clock
@@ -68,9 +67,9 @@ class SampledNode(NamedTuple):
     noise: FloatArray
 
 
-def clock_jumps(scenario: Scenario) -> ClockJumps | DelayedJumps | SlotJumps:
+def clock_jumps(scenario: Scenario) -> ClockJumps | SlotJumps:
     """Return the errors as a linear system with jumps, for Poisson clocks, or periodic ones from
-    tick to tick. Raises TheoryError for others, random delays, and delays beside bursts.
+    tick to tick. Raises TheoryError for others, random delays, and delays under Poisson clocks.
     """
     flow, samples, weights = _error_flow(scenario), _sampled_nodes(scenario), link_weights(scenario)
     clock = scenario.network.activation
@@ -80,19 +79,12 @@ def clock_jumps(scenario: Scenario) -> ClockJumps | DelayedJumps | SlotJumps:
         directions_of_tick = directions_of(scenario, weights, clock.period)
         return _from_tick_to_tick(clock, flow, samples, directions_of_tick, delay)
     directions = directions_of(scenario, weights, math.inf) if talks else None
-    if delay and directions is not None and directions.modes > 1:
-        raise TheoryError(
-            "exact mean squares of bursts under Poisson clocks are known if messages take no time"
-        )
+    if delay:
+        raise TheoryError("exact mean squares under Poisson clocks need messages that take no time")
     sampled_nodes, sampling_noise = _poisson_samples(scenario, samples)
     noise, drift = flow.noise + sampling_noise, block_diagonal(list(flow.drift))
     ticks = poisson_ticks(scenario, list(weights)) if talks else ()
-    instant = ClockJumps(len(scenario.nodes), drift, noise, sampled_nodes, directions, ticks)
-    if not delay or not ticks:
-        return instant
-    return DelayedJumps(
-        instant, scenario.diffusion.A, scenario.diffusion.B @ scenario.diffusion.B.T, delay
-    )
+    return ClockJumps(len(scenario.nodes), drift, noise, sampled_nodes, directions, ticks)
 
 
 def _node_slice(k: int, n: int) -> slice:
