@@ -23,7 +23,7 @@ from netkf.network.losses import (
     has_one_probability,
     identical_per_link,
 )
-from netkf.network.matchings import RecordedSlots
+from netkf.network.matchings import Broadcast, RecordedSlots
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import lacks_channel_law, no_channel_law
 
@@ -172,6 +172,15 @@ def directions_of(
         loss.fate_share if scenario.has_broadcasts else 0.0,
         loss.transitions if isinstance(loss, GilbertElliott) and not loss.independent else None,
     )
+
+
+def broadcast_directions(
+    scenario: Scenario, weights: dict[tuple[int, int], FloatArray]
+) -> Directions | None:
+    """Return the directed links of broadcasts, None without; TheoryError for recorded ones."""
+    if not isinstance(scenario.network.activation, Broadcast):
+        raise TheoryError("the exchanges are recorded: one outcome, not a law")
+    return directions_of(scenario, weights, scenario.phase_length) if weights else None
 
 
 def _known_delay(scenario: Scenario) -> float:

@@ -11,11 +11,15 @@ from netkf.core.clock import Clock
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, block_diagonal, square_root, symmetric
 from netkf.network.clocks import LinkClock, Periodic
-from netkf.network.matchings import Broadcast
 from netkf.plants.transitions import Transitions
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.jumps import ClockJumps, SlotJumps
-from netkf.theory.common.random_links import Directions, directions_of, poisson_ticks
+from netkf.theory.common.random_links import (
+    Directions,
+    broadcast_directions,
+    directions_of,
+    poisson_ticks,
+)
 from netkf.theory.hybrid.samples import sampling_clock
 
 
@@ -32,22 +36,8 @@ def constant_gain_jumps(scenario: Scenario) -> SlotJumps:
     closed = [np.eye(n) - L @ H for L, (H, _) in zip(gains, sensors, strict=True)]
     noise = block_diagonal([L @ R @ L.T for L, (_, R) in zip(gains, sensors, strict=True)])
     plant = scenario.linear_plant
-    return SlotJumps(plant.F, plant.Q, np.stack(closed), noise, broadcast_directions(scenario))
-
-
-def broadcast_directions(scenario: Scenario) -> Directions | None:
-    """Return the directed links of broadcasts, None without; TheoryError for recorded ones."""
-    if not isinstance(scenario.network.activation, Broadcast):
-        raise TheoryError("the exchanges are recorded: one outcome, not a law")
-    weights = link_weights(scenario)
-    return directions_of(scenario, weights, scenario.phase_length) if weights else None
-
-
-class JointErrorFlow(NamedTuple):
-    """The ``drift`` A - L H (N, n, n) of errors, and ``noise`` (N n, N n) per second of all."""
-
-    drift: FloatArray
-    noise: FloatArray
+    directions = broadcast_directions(scenario, link_weights(scenario))
+    return SlotJumps(plant.F, plant.Q, np.stack(closed), noise, directions)
 
 
 class SampledNode(NamedTuple):
@@ -71,28 +61,37 @@ def clock_jumps(scenario: Scenario) -> ClockJumps | SlotJumps:
     """Return the errors as a linear system with jumps, for Poisson clocks, or periodic ones from
     tick to tick. Raises TheoryError for others, random delays, and delays under Poisson clocks.
     """
-    flow, samples, weights = _error_flow(scenario), _sampled_nodes(scenario), link_weights(scenario)
+    drifts, noise = _error_flow(scenario)
+    samples, weights = _sampled_nodes(scenario), link_weights(scenario)
     clock = scenario.network.activation
     talks = bool(weights) and isinstance(clock, LinkClock)
     delay = scenario.network.channel.delay.fixed if talks else 0.0
     if isinstance(clock, Periodic) and talks and delay is not None:
         directions_of_tick = directions_of(scenario, weights, clock.period)
-        return _from_tick_to_tick(clock, flow, samples, directions_of_tick, delay)
+        return _from_tick_to_tick(clock, (drifts, noise), samples, directions_of_tick, delay)
     directions = directions_of(scenario, weights, math.inf) if talks else None
     if delay:
         raise TheoryError("exact mean squares under Poisson clocks need messages that take no time")
-    sampled_nodes, sampling_noise = _poisson_samples(scenario, samples)
-    noise, drift = flow.noise + sampling_noise, block_diagonal(list(flow.drift))
+    n, sampled_nodes = scenario.plant.n, []
+    for sensor in samples:
+        if sensor.clock is None or not sensor.clock.memoryless:
+            raise TheoryError(
+                f"node {scenario.nodes[sensor.node]} does not sample by a Poisson clock"
+            )
+        rate, rows = float(sensor.clock.mean_rate(sensor.entity)), _node_slice(sensor.node, n)
+        noise[rows, rows] += rate * sensor.noise
+        sampled_nodes.append((sensor.node, rate, sensor.correction))
+    drift = block_diagonal(list(drifts))
     ticks = poisson_ticks(scenario, list(weights)) if talks else ()
-    return ClockJumps(len(scenario.nodes), drift, noise, sampled_nodes, directions, ticks)
+    return ClockJumps(len(drifts), drift, noise, tuple(sampled_nodes), directions, ticks)
 
 
 def _node_slice(k: int, n: int) -> slice:
     return slice(k * n, (k + 1) * n)
 
 
-def _error_flow(scenario: Scenario) -> JointErrorFlow:
-    """Return the drift (N, n, n) of errors between events, and their noise, per second."""
+def _error_flow(scenario: Scenario) -> tuple[FloatArray, FloatArray]:
+    """Return A - L H (N, n, n) of errors, and the noise (N n, N n) of all, per second."""
     gains, truth = _node_gains(scenario), scenario.diffusion
     N, n = len(gains), len(truth.A)
     drift, noise = np.tile(truth.A, (N, 1, 1)), np.tile(truth.B @ truth.B.T, (N, N))
@@ -101,7 +100,7 @@ def _error_flow(scenario: Scenario) -> JointErrorFlow:
         if len(H):
             drift[k] -= L @ H
             noise[_node_slice(k, n), _node_slice(k, n)] += L @ R @ L.T
-    return JointErrorFlow(drift, noise)
+    return drift, noise
 
 
 def _sampled_nodes(scenario: Scenario) -> list[SampledNode]:
@@ -115,44 +114,28 @@ def _sampled_nodes(scenario: Scenario) -> list[SampledNode]:
     return sampled_nodes
 
 
-def _poisson_samples(
-    scenario: Scenario, samples: list[SampledNode]
-) -> tuple[tuple[tuple[int, float, FloatArray], ...], FloatArray]:
-    """Return (node, rate, L H) of sensors that sample, and their noise per second; TheoryError."""
-    N, n = len(scenario.nodes), scenario.plant.n
-    noise, sampled_nodes = np.zeros((N * n, N * n)), []
-    for sensor in samples:
-        if sensor.clock is None or not sensor.clock.memoryless:
-            raise TheoryError(
-                f"node {scenario.nodes[sensor.node]} does not sample by a Poisson clock"
-            )
-        rate, rows = float(sensor.clock.mean_rate(sensor.entity)), _node_slice(sensor.node, n)
-        noise[rows, rows] += rate * sensor.noise
-        sampled_nodes.append((sensor.node, rate, sensor.correction))
-    return tuple(sampled_nodes), noise
-
-
 def _from_tick_to_tick(
     clock: Periodic,
-    flow: JointErrorFlow,
+    flow: tuple[FloatArray, FloatArray],
     samples: list[SampledNode],
     directions: Directions,
     delay: float,
 ) -> SlotJumps:
     """Return the system from exchange to exchange of periodic clocks that tick together."""
     _require_one_clock(clock, samples)
-    N, n, _ = flow.drift.shape
-    if delay > 0.0 and (delay >= clock.period or not (flow.drift == flow.drift[0]).all()):
+    drift, flow_noise = flow
+    N, n, _ = drift.shape
+    if delay > 0.0 and (delay >= clock.period or not (drift == drift[0]).all()):
         raise TheoryError(
             "periodic clocks with a delay are known where it is below the period and sensors take "
             "samples"
         )
-    closed, sample_noise = np.tile(np.eye(n), (N, 1, 1)), np.zeros_like(flow.noise)
+    closed, sample_noise = np.tile(np.eye(n), (N, 1, 1)), np.zeros_like(flow_noise)
     for sensor in samples:
         closed[sensor.node] -= sensor.correction
         sample_noise[_node_slice(sensor.node, n), _node_slice(sensor.node, n)] += sensor.noise
     # From the last arrival to the tick, its samples, and from there to the arrival of its messages.
-    transitions = Transitions(block_diagonal(list(flow.drift)), square_root(flow.noise))
+    transitions = Transitions(block_diagonal(list(drift)), square_root(flow_noise))
     (to_tick, to_arrival), roots = transitions.laws(np.array([clock.period - delay, delay]))
     tick_noise, arrival_noise = roots @ np.swapaxes(roots, 1, 2)
     C = block_diagonal(list(closed))

@@ -13,10 +13,9 @@ import numpy as np
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, block_diagonal
-from netkf.network.matchings import Broadcast
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.jumps import SlotJumps
-from netkf.theory.common.random_links import all_messages_arrive, directions_of
+from netkf.theory.common.random_links import all_messages_arrive, broadcast_directions
 from netkf.theory.intermittent.riccati import steady_covariance
 
 
@@ -26,8 +25,6 @@ def consensus_jumps(scenario: Scenario) -> SlotJumps:
     """
     algorithm: Any = scenario.filter.algorithm
     nodes = scenario.nodes
-    if not isinstance(scenario.network.activation, Broadcast):
-        raise TheoryError("the exchanges are recorded: one outcome, not a law")
     (F, Q), index = scenario.slot_belief, scenario.topology.index
     heard: list[list[int]] = [[k] for k in range(len(nodes))]
     if algorithm.share_readings:
@@ -57,7 +54,7 @@ def consensus_jumps(scenario: Scenario) -> SlotJumps:
     weights: dict[tuple[int, int], FloatArray] = {
         (i, j): terms[index[j]] for i, j in scenario.topology.directions
     }
-    directions = directions_of(scenario, weights, scenario.phase_length) if weights else None
+    directions = broadcast_directions(scenario, weights)
     stacked_gains = gains.reshape(-1, rows[-1])
     plant, noise = scenario.linear_plant, stacked_gains @ true @ stacked_gains.T
     return SlotJumps(plant.F, plant.Q, np.stack(closed), noise, directions, on_predictions=True)
