@@ -78,19 +78,12 @@ def _ecdf_gaps(first: FloatArray, second: FloatArray, rounding: float) -> FloatA
 def _band_interval(gaps: FloatArray, a: int, b: int, level: float, grow: bool) -> Interval:
     """Return the interval of the largest of ``gaps`` (V,), with a band around each sample."""
     value = max(0.0, float(gaps.max()))
-    widths = band_width(a, level / 2.0), band_width(b, level / 2.0)
-    width = sum(widths)
-
-    def limits(value: float, factor: float) -> tuple[float, float]:
-        first, second = widths[0] / math.sqrt(factor), widths[1]
-        reach = first + (second / math.sqrt(factor) if grow else second)
-        return value - reach, value + reach
-
+    first, second = band_width(a, level / 2.0), band_width(b, level / 2.0)
     # At any one point the standard deviation of the difference is at most sqrt(1/(4a) + 1/(4b)).
     spread = 0.5 * math.sqrt(1.0 / a + 1.0 / b)
-    detectable = min(1.0, width + float(scipy.special.ndtri(POWER)) * spread)
-    ends = max(0.0, value - width), min(1.0, value + width)
-    return Interval(value, *ends, detectable, again=limits)
+    detectable = first + second + float(scipy.special.ndtri(POWER)) * spread
+    shrinking = first + (second if grow else 0.0)
+    return band_around(value, shrinking, detectable, first + second - shrinking)
 
 
 def distance_to_law(
@@ -107,19 +100,21 @@ def distance_to_law(
     value = float(max(above.max(), below.max()))
     width = band_width(len(values), level)
     spread = 0.5 / math.sqrt(len(values))
-    detectable = min(1.0, width + float(scipy.special.ndtri(POWER)) * spread)
-    return band_around(value, width, detectable)
+    return band_around(value, width, width + float(scipy.special.ndtri(POWER)) * spread)
 
 
-def band_around(value: float, width: float, detectable: float = math.nan) -> Interval:
-    """Return ``value`` +- ``width`` in [0, 1], a distance that shrinks as 1 / sqrt(runs)."""
+def band_around(
+    value: float, width: float, detectable: float = math.nan, fixed: float = 0.0
+) -> Interval:
+    """Return ``value`` +- (``width`` + ``fixed``) in [0, 1]; more runs make the width smaller."""
 
     def limits(value: float, factor: float) -> tuple[float, float]:
-        reach = width / math.sqrt(factor)
+        reach = width / math.sqrt(factor) + fixed
         return value - reach, value + reach
 
-    ends = max(0.0, value - width), min(1.0, value + width)
-    return Interval(value, *ends, detectable, again=limits)
+    low, high = limits(value, 1.0)
+    ends = max(0.0, low), min(1.0, high), min(detectable, 1.0)
+    return Interval(value, *ends, again=limits)
 
 
 def quadratic_interval(total: float, weights: FloatArray, level: float) -> Interval:
