@@ -24,9 +24,9 @@ from netkf.algorithms.filter import Filter, NodeInfo, Reading, interval_rule, ma
 from netkf.algorithms.traits import Analysis, Needs, Timing, Weights
 from netkf.core.errors import NetkfError
 from netkf.linalg.arrays import FloatArray, square_root
+from netkf.plants.transitions import Transitions
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
-from netkf.theory.numerics.prediction import StateFlow
 from netkf.trace.run import Run, first_difference
 
 LOG_2PI = math.log(2.0 * math.pi)
@@ -112,12 +112,11 @@ class ExpectedIncrements:
 
     def __init__(self, model: Any) -> None:
         """Take A and Q (n, n), H (p, n) and R (p, p) of ``model``."""
-        n = len(model.A)
-        self._n, self._H, self._R = n, model.H, model.R
+        zero, eye = np.zeros_like(model.A), np.eye(len(model.A))
+        self._H, self._R = model.H, model.R
         # The joint equation of (x, z): dx = A x ds + dw and dz = x ds.
-        A = np.block([[model.A, np.zeros((n, n))], [np.eye(n), np.zeros((n, n))]])
-        B = np.concatenate([square_root(model.Q), np.zeros((n, n))])
-        self._equation = StateFlow(A, B)
+        A = np.block([[model.A, zero], [eye, zero]])
+        self._transitions = Transitions(A, np.concatenate([square_root(model.Q), zero]))
 
     def innovation(
         self, xhat: FloatArray, P: FloatArray, y: FloatArray, gap: float
@@ -125,15 +124,11 @@ class ExpectedIncrements:
         """Return y - H E[z] (p,) of increments over ``gap`` s and the Cholesky factor of its
         covariance, after the estimate ``xhat`` (n,), ``P`` (n, n).
         """
-        n, H = self._n, self._H
-        # Transition F of (x, z) over the gap, and its noise covariance Q, from a short part of it.
-        doublings = max(0, math.ceil(math.log2(gap / self._equation.unit)))
-        F, response = self._equation(gap / 2.0**doublings)
-        Q = response @ response.T
-        for _ in range(doublings):
-            F, Q = F @ F, Q + F @ Q @ F.T
-        J = F[n:, :n]  # integral of exp(A s) over the gap, so that E[z] = J xhat
-        S = H @ (J @ P @ J.T + Q[n:, n:]) @ H.T + self._R * gap
+        n, H = len(xhat), self._H
+        F, root = (law[0] for law in self._transitions.laws(np.array([gap])))
+        # J is the integral of exp(A s) over the gap, so that E[z] = J xhat.
+        J, noise = F[n:, :n], root[n:]
+        S = H @ (J @ P @ J.T + noise @ noise.T) @ H.T + self._R * gap
         return y - H @ J @ xhat, np.linalg.cholesky(S)
 
 
