@@ -28,10 +28,6 @@ from netkf.trace.run import Run
 from netkf.trace.schema import rows_of
 
 NO_CLOCKS = ClockGroup((), np.empty(0), (), ())
-MAX_BASE = 1 << 31
-"""Ids beyond which two do not fit into one integer."""
-MAX_TABLE = 1 << 22
-"""Largest table of all pairs of ids."""
 
 
 @lru_cache(maxsize=8)
@@ -240,21 +236,16 @@ def _pairs_of_hearers(messages: np.ndarray, is_lost: np.ndarray) -> list[np.ndar
 
 def _entity_indices(entities: Sequence[Entity], columns: Sequence[np.ndarray]) -> IntArray:
     """Return the index among ``entities`` of each row of the ``columns`` of ids, -1 for none."""
-    # -1 stands for no node.
-    known = np.array(entities, dtype=np.int64).reshape(-1, len(columns)).T + 1
-    rows = np.stack(columns).astype(np.int64) + 1
-    base = 1 + max(int(known.max(initial=0)), int(rows.max(initial=0)))
-    if base > MAX_BASE:
-        ids = np.unique(np.concatenate([known.ravel(), rows.ravel()]))
-        known, rows, base = np.searchsorted(ids, known), np.searchsorted(ids, rows), len(ids)
-    # One integer for each entity, and for each row.
-    keys, wanted = known[0], rows[0]
-    for own, column in zip(known[1:], rows[1:], strict=True):
-        keys, wanted = keys * base + own, wanted * base + column
-    if (size := base ** len(columns)) <= MAX_TABLE:
-        table = np.full(size, -1, dtype=np.int64)
-        table[keys] = np.arange(len(keys))
-        return np.asarray(table[wanted])
+    known = np.array(entities, dtype=np.int64).reshape(-1, len(columns)).T
+    ids = np.unique(known)
+
+    def codes(part: np.ndarray) -> IntArray:
+        places = np.searchsorted(ids, part)
+        # The last place stands for an id of no entity.
+        places[np.append(ids, 0)[places] != part] = len(ids)
+        return np.asarray(np.ravel_multi_index(tuple(places), (len(ids) + 1,) * len(columns)))
+
+    keys, wanted = codes(known), codes(np.stack(columns))
     order = np.argsort(keys)
     found = order[np.minimum(np.searchsorted(keys[order], wanted), len(order) - 1)]
     return np.where(keys[found] == wanted, found, -1).astype(np.int64)

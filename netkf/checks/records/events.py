@@ -150,12 +150,10 @@ def _decided(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
     ends = np.flatnonzero(np.isin(log["kind"], (DELIVER, LOST, LATE)))
     last = log[ends]
     is_lost = last["kind"] == LOST
-    senders = np.where(is_lost, last["node"], last["peer"])
-    receivers = np.where(is_lost, last["peer"], last["node"])
-    every = _keys(log, log["node"], log["peer"])[log["kind"] == SEND]
-    keys = _keys(log, log["node"], log["peer"])[ends]
-    backwards = _keys(log, log["peer"], log["node"])[ends]
-    keys = np.where((senders == last["node"]) & (receivers == last["peer"]), keys, backwards)
+    # A message is sent and lost by the node of its row, but arrives there.
+    arrives, node, peer = np.isin(log["kind"], (DELIVER, LATE)), log["node"], log["peer"]
+    links = np.where(arrives, peer, node), np.where(arrives, node, peer)
+    every, keys = (_keys(log, *links)[rows] for rows in (send_rows, ends))
     order = np.argsort(every, kind="stable")
     place = np.searchsorted(every[order], keys)
     known = place < len(every)
