@@ -152,9 +152,9 @@ GAUSSIAN_TESTS: set[Callable[[Any, float], Finding]] = set()
 
 
 def gaussian_test(test: Callable[[Any, float], Finding]) -> Callable[[Any, float], Finding]:
-    """Mark a test as valid only if all noises are Gaussian, and return it."""
+    """Mark a test of the law of errors that needs Gaussian noises, and return it."""
     GAUSSIAN_TESTS.add(test)
-    return test
+    return error_test(test)
 
 
 class Assumption(NamedTuple):
@@ -321,17 +321,12 @@ def find_identity(deviation: float, allowed: float, message: str) -> Finding:
     return finding._replace(seen=deviation, expected=0.0, off=deviation, detectable=allowed)
 
 
-def find_nothing(tolerance: float) -> Finding:
-    """Return the undecided finding of a test whose errors are all blurred by rounding."""
-    nan = math.nan
-    message = (
-        "the state is so large that rounding blurs the errors wherever they are looked at; shorten "
-        "the horizon"
-    )
-    return Finding((nan, nan, nan), tolerance, message, blurred=True)
-
-
 def find_unknown(reason: str, tolerance: float = 0.0) -> Finding:
     """Return the finding of a test that has nothing to compare: undecided, with the reason."""
-    nan = math.nan
-    return Finding((nan, nan, nan), tolerance, reason, blurred=True)
+    return Finding((math.nan,) * 3, tolerance, reason, blurred=True)
+
+
+def find_nothing(tolerance: float) -> Finding:
+    """Return the undecided finding of a test whose errors are all blurred by rounding."""
+    large = "the state is so large that rounding blurs the errors wherever they are looked at"
+    return find_unknown(f"{large}; shorten the horizon", tolerance)

@@ -317,7 +317,6 @@ def _compare_with_exact(
     return compare_points(samples, measure(P - Sigma) * known, limits, message)
 
 
-@error_test
 @gaussian_test
 def check_error_covariance(samples: RunSamples, level: float) -> Finding:
     """Test that errors have their exact law given the events: e' Sigma^-1 e is chi-square at every
@@ -404,7 +403,6 @@ def _length_interval(spread: FloatArray, z: FloatArray, level: float) -> Interva
     return Interval(value, low, value + max_reach, detectable, seen=value, expected=0.0)
 
 
-@error_test
 @gaussian_test
 def check_expected_nees(samples: RunSamples, level: float) -> Finding:
     """Test that NEES, a sum of squares of normals weighted by the eigenvalues of P^-1 Sigma, scaled
@@ -452,7 +450,6 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
     return finding._replace(message=finding.message + samples.blurred_note, most_runs=max_runs)
 
 
-@error_test
 @gaussian_test
 def check_nees(samples: RunSamples, level: float) -> Finding:
     """Test that errors are Gaussian with covariance P: the sum of NEES over R runs is chi-square

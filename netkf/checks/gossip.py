@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
@@ -24,12 +23,12 @@ from netkf.checks.laws import (
 from netkf.checks.mode_sequences import (
     FAR_START,
     MIN_CHAINS,
+    Reference,
     SwitchedReference,
     check_bounded,
     check_initial_condition,
     check_law,
     gossip_modes,
-    growth_of,
     initial_roots,
     pair_sources,
     reference_count,
@@ -121,64 +120,29 @@ def _count_moves(scenario: Scenario, sources: np.ndarray) -> np.ndarray:
     return np.where(codes[positions] == i * size + j, counts[positions], 0)
 
 
-class Chains(NamedTuple):
-    """S simulations of the switched chain of paper G (20): the node that holds one pair (estimate,
-    covariance) is a Markov chain with transition matrix Abar (the mean matching: entry (i, j) is
-    the probability that i gets j's pair in a slot), and that node's reading updates the covariance.
-
-    P         : (K, S, n, n) covariances at the K ``slots``
-    restarted : (S, n, n) covariances at the last slot from a start about 1000 times larger
-    positions : (S, slots) node of each chain in each slot
-    """
-
-    slots: list[int]
-    P: FloatArray
-    restarted: FloatArray
-    positions: np.ndarray
-
-    def at(self, k: int, i: int) -> FloatArray:
-        """Return the covariances whose last reading was that of node i."""
-        return np.asarray(self.P[k, self.positions[:, self.slots[k] - 1] == i])
-
-    def restarted_at(self, i: int) -> FloatArray:
-        """Return the same from the larger start."""
-        return np.asarray(self.restarted[self.positions[:, -1] == i])
-
-    def growth(self) -> float:
-        """Return the growth of the law of the chain's covariance between its last two slots."""
-        return growth_of(self.P[-2], self.P[-1])
-
-    def memory(self) -> float:
-        """Return the distance of the laws from P(0) and from a far larger start at the end."""
-        return float(diagonal_distances(self.P[-1], self.restarted).max())
-
-    def token_memory(self) -> float:
-        """Return the largest distance of the law of chains from one node to that of all."""
-        last, origin = self.P[-1], self.positions[:, 0]
-        starts = [start for start in np.unique(origin) if (origin == start).sum() >= MIN_TOKENS]
-        distances = (float(diagonal_distances(last[origin == k], last).max()) for k in starts)
-        return max(distances, default=math.nan)
-
-
 @dataclass(frozen=True)
 class GossipSamples(SwitchedReference):
-    """Adds samples of the switched chain."""
+    """Adds simulations of the switched chain of paper G (20): the node that holds one pair
+    (estimate, covariance) is a Markov chain with transition matrix Abar (the mean matching: entry
+    (i, j) is the probability that i gets j's pair in a slot), and that node's reading updates the
+    covariance.
+    """
 
     @cached_property
     def matching(self) -> FloatArray:
         """Abar (N, N): the probability that i gets j's pair in a slot, with losses."""
         return effective_matching(self.scenario)
 
-    def draw_reference(self) -> Chains:
+    def draw_reference(self) -> Reference:
         """Return chains at the checked slots: one law, that of one which wanders over all nodes."""
         slots = list(check_slots(self.scenario))
         return self._draw_paths("switched chain", slots, reference_count(self.scenario, laws=1))
 
-    def later(self, slots: int) -> Chains:
+    def later(self, slots: int) -> Reference:
         """Return a few chains after half of ``slots`` and after all of them."""
         return self._draw_paths("later chain", [slots // 2, slots], MIN_CHAINS // 4)
 
-    def _draw_paths(self, purpose: str, slots: list[int], count: int) -> Chains:
+    def _draw_paths(self, purpose: str, slots: list[int], count: int) -> Reference:
         # Square roots of P(0) (N, n, n), which the recursions work with.
         starts, random = initial_roots(self.scenario), Streams(self.seed).generator(purpose)
         positions = _draw_chains(self.matching, slots[-1], count, random)
@@ -187,7 +151,8 @@ class GossipSamples(SwitchedReference):
         larger_roots = FAR_START * start_roots + np.eye(start_roots.shape[-1])
         restarted = table.covariances(larger_roots, positions, slots[-1:])[0]
         P = table.covariances(start_roots, positions, slots)
-        return Chains(slots, P, restarted, positions)
+        last = positions[:, np.array(slots) - 1].T
+        return Reference(P[None], restarted[None], at_node=last, first=positions[:, 0])
 
 
 def _draw_chains(
@@ -247,7 +212,7 @@ def _random_sensor(samples: GossipSamples, level: float) -> Finding:
     runs, nodes = np.arange(samples.count), len(samples.scenario.nodes)
     picks = random.integers(nodes, size=(len(check_slots(samples.scenario)), samples.count))
     pairs = [
-        Pair(f"slot {slot}", samples.runs.P[runs, k, picks[k]], samples.reference.P[k])
+        Pair(f"slot {slot}", samples.runs.P[runs, k, picks[k]], samples.reference.P[0, k])
         for k, slot in enumerate(check_slots(samples.scenario))
     ]
     return compare_laws(pairs, level, samples.first_trace)
@@ -256,7 +221,7 @@ def _random_sensor(samples: GossipSamples, level: float) -> Finding:
 def _sensors_together(samples: GossipSamples, level: float) -> Finding:
     """Compare P(tr P_n >= x) of all nodes with that of the switched chain, for all x."""
     traces = np.trace(samples.runs.P, axis1=-2, axis2=-1)
-    expected = np.trace(samples.reference.P, axis1=-2, axis2=-1)
+    expected = np.trace(samples.reference.P[0], axis1=-2, axis2=-1)
     N, band_level = traces.shape[2], level / (2 * traces.shape[1])
     # Half widths of the bands around the law at one node and around that of the chain.
     widths = band_width(len(traces), band_level / N), band_width(expected.shape[1], band_level)
@@ -281,14 +246,22 @@ def _share_from(values: FloatArray, points: FloatArray) -> FloatArray:
     return np.asarray(1.0 - below / len(values))
 
 
+def _token_memory(chains: Reference) -> float:
+    """Return the largest distance of the law of chains from one node to that of all."""
+    last, origin = chains.P[0, -1], chains.first
+    starts = [start for start in np.unique(origin) if (origin == start).sum() >= MIN_TOKENS]
+    distances = (float(diagonal_distances(last[origin == k], last).max()) for k in starts)
+    return max(distances, default=math.nan)
+
+
 def _check_tokens(samples: GossipSamples, level: float) -> Finding:
     last, pairs = len(check_slots(samples.scenario)) - 1, []
-    chain, origin = samples.reference.P[last], samples.reference.positions[:, 0]
+    chain, origin = samples.reference.P[0, last], samples.reference.first
     for i, node in enumerate(samples.nodes):
         token_covariances = samples.runs.tokens[:, i]
         pairs.append(Pair(f"token {node}", token_covariances, chain, chain[origin == i]))
     finding = compare_laws(pairs, level, samples.first_trace)
-    return samples.with_horizon(finding, lambda chains: chains.token_memory())
+    return samples.with_horizon(finding, _token_memory)
 
 
 # What promises need: parts of names or sources in the table of assumptions, see ``Promise.needs``.

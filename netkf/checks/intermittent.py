@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +17,6 @@ from netkf.checks.exact import check_nees, summarise_exactly
 from netkf.checks.laws import (
     FIXED_READINGS,
     LAW_TOLERANCE,
-    diagonal_distances,
     find_largest,
     fixed_readings,
 )
@@ -26,12 +24,12 @@ from netkf.checks.mode_sequences import (
     FAR_START,
     MIN_CHAINS,
     ModeTable,
+    Reference,
     SwitchedReference,
     check_bounded,
     check_initial_condition,
     check_law,
     find_arrivals,
-    growth_of,
     initial_roots,
     intermittent_modes,
     reference_count,
@@ -151,57 +149,26 @@ def _path_averages(table: ModeTable, roots: FloatArray, sequences: np.ndarray) -
     return np.array(averages)
 
 
-class ArrivalSamples(NamedTuple):
-    """S simulated covariances of each of N nodes: readings arrive independently, with the delivery
-    probabilities that the scenario states.
-
-    P         : (N, K, S, n, n) covariances at the K slots
-    restarted : (N, S, n, n) covariances at the last slot from a start about 1000 times larger
-    averages  : (N, S') averages of 1 / (1 + tr P) over the slots, for the first S' of them
-    """
-
-    P: FloatArray
-    restarted: FloatArray
-    averages: FloatArray
-
-    def at(self, k: int, i: int) -> FloatArray:
-        """Return the covariances of node i at slot number k."""
-        return np.asarray(self.P[i, k])
-
-    def restarted_at(self, i: int) -> FloatArray:
-        """Return the same at the last slot from the larger start."""
-        return np.asarray(self.restarted[i])
-
-    def growth(self) -> float:
-        """Return the largest growth of the law of P between the last two numbers of slots."""
-        return max(growth_of(P[-2], P[-1]) for P in self.P)
-
-    def memory(self) -> float:
-        """Return the largest distance at the end of the laws from P(0) and a far larger start."""
-        pairs = zip(self.P, self.restarted, strict=True)
-        return max(float(diagonal_distances(P[-1], restarted).max()) for P, restarted in pairs)
-
-
 @dataclass(frozen=True)
 class IntermittentSamples(SwitchedReference):
-    """Adds simulated covariances with independent arrivals, paper R (12)."""
+    """Adds simulated covariances of each node, to which readings arrive independently, with the
+    delivery probabilities that the scenario states, paper R (12).
+    """
 
-    def draw_reference(self) -> ArrivalSamples:
+    def draw_reference(self) -> Reference:
         """Return covariances at the checked slots, drawn from random streams of their own."""
         count = reference_count(self.scenario, laws=len(self.nodes))
         return self._draw_arrivals("arrivals", list(check_slots(self.scenario)), count, MAX_PATHS)
 
-    def later(self, slots: int) -> ArrivalSamples:
+    def later(self, slots: int) -> Reference:
         """Return a few covariances after half of ``slots`` and all of them, without averages."""
         halves, samples = [slots // 2, slots], MIN_CHAINS // 4
         return self._draw_arrivals("later arrivals", halves, samples, paths=0)
 
-    def _draw_arrivals(
-        self, purpose: str, slots: list[int], samples: int, paths: int
-    ) -> ArrivalSamples:
+    def _draw_arrivals(self, purpose: str, slots: list[int], samples: int, paths: int) -> Reference:
         sampled = sampled_indices(self.scenario).tolist()
         per_node = [self._draw_node(purpose, k, slots, samples, paths) for k in sampled]
-        return ArrivalSamples(*(np.array(values) for values in zip(*per_node, strict=True)))
+        return Reference(*(np.array(values) for values in zip(*per_node, strict=True)))
 
     def _draw_node(
         self, purpose: str, k: int, slots: list[int], samples: int, paths: int

@@ -12,13 +12,20 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from netkf.algorithms.kernels.chains import ReadingModes, move_roots, reading_modes
 from netkf.checks.evidence import Finding
-from netkf.checks.laws import LAW_TOLERANCE, Pair, compare_growth, compare_laws, growth_intervals
+from netkf.checks.laws import (
+    LAW_TOLERANCE,
+    Pair,
+    compare_growth,
+    compare_laws,
+    diagonal_distances,
+    growth_intervals,
+)
 from netkf.checks.points import MAX_NODES, check_slots, sampled_nodes
 from netkf.checks.samples import RunSamples
 from netkf.linalg.arrays import FloatArray, block_diagonal, square_root
@@ -70,20 +77,42 @@ def reference_count(scenario: Scenario, laws: int) -> int:
     return int(np.clip(affordable, MIN_CHAINS, MAX_CHAINS))
 
 
-class Reference(Protocol):
-    """Simulated covariances whose laws those of the runs should have."""
+class Reference(NamedTuple):
+    """S simulated covariances of L laws, whose laws those of the runs should have: one for each
+    sampled node, or that of a chain of which each sampled node has the draws at it.
+
+    P         : (L, K, S, n, n) covariances at K numbers of slots
+    restarted : (L, S, n, n) covariances at the last one from a start about 1000 times larger
+    averages  : (L, S') averages of 1 / (1 + tr P) over the slots, of the first S'
+    at_node   : (K, S) index of the node at which a chain had its last reading, or None
+    first     : (S,) index of the node at which it began
+    """
+
+    P: FloatArray
+    restarted: FloatArray
+    averages: FloatArray = np.empty(0)
+    at_node: np.ndarray | None = None
+    first: np.ndarray = np.empty(0, dtype=int)
 
     def at(self, k: int, i: int) -> FloatArray:
-        """Return the covariances (S, n, n) at the k-th checked slot and the i-th sampled node."""
+        """Return the covariances (S, n, n) at the k-th number of slots and the i-th node."""
+        return self._of_node(self.P[:, k], k, i)
 
     def restarted_at(self, i: int) -> FloatArray:
-        """Return those at the last slot from a start about 1000 times larger (S, n, n)."""
+        """Return those at the last number of slots from the larger start (S, n, n)."""
+        return self._of_node(self.restarted, -1, i)
+
+    def _of_node(self, values: FloatArray, k: int, i: int) -> FloatArray:
+        return np.asarray(values[i] if self.at_node is None else values[0, self.at_node[k] == i])
 
     def growth(self) -> float:
-        """Return the growth of the law of P between the last two slots."""
+        """Return the largest growth of the law of P between the last two numbers of slots."""
+        return max(growth_of(P[-2], P[-1]) for P in self.P)
 
     def memory(self) -> float:
-        """Return the distance at the end of the laws from P(0) and from the larger start."""
+        """Return the largest distance at the end of the laws from P(0) and a far larger start."""
+        pairs = zip(self.P, self.restarted, strict=True)
+        return max(float(diagonal_distances(P[-1], restarted).max()) for P, restarted in pairs)
 
 
 @dataclass(frozen=True)
@@ -93,8 +122,8 @@ class SwitchedReference(RunSamples):
     """
 
     @property
-    def reference(self) -> Any:
-        """The :class:`Reference` of all looks at the runs of a seed."""
+    def reference(self) -> Reference:
+        """That of all looks at the runs of a seed."""
         cls: Any = type(self)
         return _cached_reference(cls, self.scenario, self.seed)
 
@@ -106,7 +135,7 @@ class SwitchedReference(RunSamples):
         """Return a few covariances after half of ``slots`` and after all of them."""
         raise NotImplementedError
 
-    def with_horizon(self, finding: Finding, distance: Callable[[Any], float]) -> Finding:
+    def with_horizon(self, finding: Finding, distance: Callable[[Reference], float]) -> Finding:
         """Return a finding whose limit is not reached with the horizon (s) at which it would be;
         ``distance`` tells how far the law of a reference is from its limit.
         """

@@ -145,7 +145,6 @@ def _check_unbiased(samples: PushSumSamples, level: float) -> Finding:
     return find_largest(intervals, BIAS_TOLERANCE, message)._replace(most_runs=max_runs)
 
 
-@error_test
 @gaussian_test
 def _mean_square(samples: PushSumSamples, level: float) -> Finding:
     if not len(samples.followed):
