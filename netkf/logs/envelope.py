@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from scipy.special import expit, logit
 from scipy.stats import t as student_t
 
 from netkf.core.fields import SourceFile
 from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import Progress, replicate
 from netkf.linalg.arrays import FloatArray
-from netkf.logs.outcomes import FittedChain
 from netkf.network.losses import GilbertElliott
 from netkf.network.scheduled import ScheduledLoss
 from netkf.runs.connectivity import ConnectivitySink
@@ -73,7 +73,7 @@ class FittedLaw(NamedTuple):
             return np.asarray(random.beta(heard + 0.5, count - heard + 0.5))
         assert self.cov is not None
         if self.kind == "gilbert-elliott":
-            return FittedChain(self.values, self.cov, 0.0).draw(random)
+            return expit(random.multivariate_normal(logit(self.values), self.cov))
         while True:
             one, two = random.multivariate_normal(self.values, self.cov)
             if self.kind == "shared":

@@ -74,9 +74,8 @@ def _new_folder(run: Run, out: str | Path) -> tuple[Path, Scenario]:
 
 
 def _messages_of(scenario: Scenario, run: Run, to_the_end: bool) -> np.ndarray:
-    """Return the MESSAGE rows of a run in the order of sending, with those in slots at the horizon,
-    which samples there use; raises TheoryError if they are wanted ``to_the_end`` and unknown.
-    """
+    """Return the MESSAGE rows of a run; TheoryError if unknown at the horizon, ``to_the_end``."""
+    # Those in slots at the horizon too: samples there use them.
     logs = [run.log]
     try:
         if scenario.slotted and (whole := with_last_exchanges(scenario, run)) is not run:
@@ -86,9 +85,8 @@ def _messages_of(scenario: Scenario, run: Run, to_the_end: bool) -> np.ndarray:
             raise
     found = [join_messages(log) for log in logs]
     found = [rows[np.argsort(rows["sent_row"], kind="stable")] for rows in found]
-    return np.concatenate(
-        [found[0], *(rows[rows["sent"] >= scenario.horizon] for rows in found[1:])]
-    )
+    later = [rows[rows["sent"] >= scenario.horizon] for rows in found[1:]]
+    return np.concatenate([found[0], *later])
 
 
 def _outcomes(scenario: Scenario, messages: np.ndarray, channel: dict[str, Any]) -> Files:

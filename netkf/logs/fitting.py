@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -111,15 +112,10 @@ class LogFit(NotebookTable):
         )
 
 
-@dataclass(frozen=True)
-class StoredFit:
-    """The ``envelope`` of a fit that is read back from its directory, as in :class:`LogFit`."""
-
-    envelope: pd.DataFrame
-
-
-def read_fit(directory: Path) -> StoredFit:
-    """Return what ``netkf fit`` left in a directory; raises ScenarioError for a damaged file."""
+def read_fit(directory: Path) -> SimpleNamespace:
+    """Return the ``envelope`` that ``netkf fit`` left in a directory, as in :class:`LogFit`; raises
+    ScenarioError for a damaged file.
+    """
     path = directory / FIT_FILE
     try:
         table = pd.read_csv(path)
@@ -128,7 +124,7 @@ def read_fit(directory: Path) -> StoredFit:
     except ValueError:  # of pandas too
         rule = "is not a table that netkf fit left"
         raise ScenarioError(str(path), rule, None, "run netkf fit again") from None
-    return StoredFit(table)
+    return SimpleNamespace(envelope=table)
 
 
 def fit_log(
@@ -241,9 +237,7 @@ def read_outcomes(scenario: Scenario) -> tuple[pd.DataFrame, list[str]]:
 def _tell_channels(
     table: pd.DataFrame, seed: int, notes: list[str]
 ) -> tuple[pd.DataFrame, dict[str, Test]]:
-    """Return a table whose messages all have a channel, or none of them, and the test of channels,
-    which is of those that are told; {} if all are.
-    """
+    """Return messages that all have a channel, or none, and the test of those told, or {}."""
     untold = int((table["channel"] == "").sum()) if "channel" in table else 0
     if not 0 < untold < len(table):
         return table, {}
@@ -321,19 +315,18 @@ def run_tests(
         "memory": stats.test_memory(steady),
         "fate": fate,
         "constancy": constancy,
-        "links": stats.test_identical(ASSUMPTIONS["links"], counts, pooled, spread, 1),
+        "links": stats.test_identical(counts, pooled, spread, 1),
     }
     parts = outcomes.by_channel.astype(float)
     if len(parts) > 1:
         own = np.tile(counts[:, 1] / np.maximum(counts[:, 0], 1.0), (len(parts), 1)).ravel()
-        name, flat = ASSUMPTIONS["channel"], parts.reshape(-1, 2)
-        spreads = np.tile(spread, len(parts))
-        found["channel"] = stats.test_identical(name, flat, own, spreads, len(counts))
+        flat, spreads = parts.reshape(-1, 2), np.tile(spread, len(parts))
+        found["channel"] = stats.test_identical(flat, own, spreads, len(counts))
     found |= _direction_test(outcomes, counts, slack)
     if distance is not None and len(counts) > 2:
         values, _ = stats.fit_distance(*distance[:3], slack)
         curve = distance.mean_by_link(expit((values[0] - distance.value) / values[1]))
-        found["distance"] = stats.test_identical(ASSUMPTIONS["distance"], counts, curve, spread, 2)
+        found["distance"] = stats.test_identical(counts, curve, spread, 2)
     return found, share, time, edges
 
 
@@ -348,10 +341,7 @@ def _direction_test(outcomes: LogOutcomes, counts: FloatArray, slack: float) -> 
     together = pairs.sum(axis=0)
     expected = np.tile(together[:, 1] / np.maximum(together[:, 0], 1.0), 2)
     spread = np.full(len(order), slack)
-    name = ASSUMPTIONS["directions"]
-    return {
-        "directions": stats.test_identical(name, counts[order], expected, spread, len(both)),
-    }
+    return {"directions": stats.test_identical(counts[order], expected, spread, len(both))}
 
 
 def _test_table(tests: Mapping[str, Test], level: float) -> pd.DataFrame:
@@ -565,9 +555,7 @@ def _law_table(
 def _fit_delays(
     scenario: Scenario, table: pd.DataFrame, notes: list[str]
 ) -> tuple[dict[str, Any], dict[str, Test]]:
-    """Return a delay law in place of a recorded one, and its test, or {} each: delays of lost
-    messages are in no record.
-    """
+    """Return a delay law in place of a recorded one, without lost messages, and its test, or {}."""
     delay = scenario.network.channel.delay
     if not isinstance(delay, RecordedDelay):
         return {}, {}
@@ -600,7 +588,7 @@ def _fit_delays(
     law = DELAYS[kind](**values).law
     if law is None or at_once:
         return {"kind": kind, **values}, {}
-    return {"kind": kind, **values}, {"delay": stats.test_law(ASSUMPTIONS["delay"], seconds, law)}
+    return {"kind": kind, **values}, {"delay": stats.test_law(seconds, law)}
 
 
 def _write(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -15,12 +14,13 @@ from netkf.logs.packet_tables import read_tables
 from netkf.logs.packets import HOLE, PacketLog
 from netkf.logs.recorded_network import Files, write_network
 from netkf.logs.ulb import read_ulb
-from netkf.runs.files import make_directory, write_text, writing_file
+from netkf.runs.files import copy_file, make_directory, write_text
 from netkf.scenario.reading import load
 
 DATA_SETS: Mapping[str, Callable[[Path], PacketLog]] = {"ulb": read_ulb, "mercator": read_mercator}
 """By kind of a packet log that is no table of any columns, the function that reads it."""
 KINDS = ("csv", "ulb", "mercator", "mrclam")
+UNREPORTED = ("unknown", "lost")
 
 
 def import_log(
@@ -80,16 +80,11 @@ def import_log(
     return tuple(paths), notes
 
 
-UNREPORTED = ("unknown", "lost")
-
-
 def write_folder(folder: Path, files: Files) -> None:
     """Write texts, and copy files, by name into a folder. Raises WriteError."""
     make_directory(folder)
     for name, content in files.items():
         if isinstance(content, str):
             write_text(folder / name, content)
-            continue
-        with writing_file(folder / name):
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(content, folder / name)
+        else:
+            copy_file(content, folder / name)

@@ -8,9 +8,9 @@ kept in all variances: sums go over transmissions, which are the units.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations_with_replacement
 from typing import NamedTuple
 
 import numpy as np
@@ -34,7 +34,7 @@ MIN_PACKETS = 10
 
 
 class Test(NamedTuple):
-    """One assumption about outcomes and what the log says of it.
+    """What the log says of one assumption about outcomes.
 
     estimate : of the departure, in the words of ``what``
     p        : of a departure as large or larger by chance; nan where nothing can be tested
@@ -43,11 +43,10 @@ class Test(NamedTuple):
     rise     : by how much the variance grows with the departure, as a share of that without one
     """
 
-    assumption: str
     what: str
-    estimate: float
-    p: float
-    unit: float
+    estimate: float = math.nan
+    p: float = math.nan
+    unit: float = math.nan
     freedom: float = 0.0
     power: int = 2
     rise: float = 0.0
@@ -69,7 +68,7 @@ class Test(NamedTuple):
         return self.unit * float(noncentrality ** (1.0 / self.power))
 
 
-def test_law(assumption: str, values: FloatArray, law: WaitingLaw) -> Test:
+def test_law(values: FloatArray, law: WaitingLaw) -> Test:
     """Return the test that independent ``values`` (K,) have a ``law`` that was fitted to them: by
     Kolmogorov and Smirnov, whose p is then too large, never too small.
     """
@@ -83,7 +82,7 @@ def test_law(assumption: str, values: FloatArray, law: WaitingLaw) -> Test:
     # Of a normal law with this standard error about as much is found as of Kolmogorov's.
     unit = 0.62 / math.sqrt(len(values))
     what = "distance of distribution functions"
-    return Test(assumption, what, distance, float(kstwo.sf(distance, len(values))), unit)
+    return Test(what, distance, float(kstwo.sf(distance, len(values))), unit)
 
 
 class Group(NamedTuple):
@@ -270,16 +269,14 @@ def binomial_interval(
     return low, high
 
 
-def _z_test(assumption: str, what: str, units: FloatArray, scale: float) -> Test:
+def _z_test(what: str, units: FloatArray, scale: float) -> Test:
     """Return a test that ``units`` (T,), as large as ``scale`` for 1, have mean 0."""
-    variance = long_run_sum(units, 0)
-    if scale <= 0.0 or variance <= 0.0 or len(units) < MIN_PACKETS:
-        return Test(assumption, what, np.nan, np.nan, np.nan)
-    deviation = math.sqrt(variance)
-    if deviation > 0.5 * scale:  # no departure is above 1
-        return Test(assumption, what, np.nan, np.nan, np.nan)
+    deviation = math.sqrt(long_run_sum(units, 0))
+    # No departure is above 1.
+    if not 0.0 < deviation <= 0.5 * scale or len(units) < MIN_PACKETS:
+        return Test(what)
     p = 2.0 * float(norm.sf(abs(units.sum()) / deviation))
-    return Test(assumption, what, float(units.sum() / scale), p, deviation / scale)
+    return Test(what, float(units.sum() / scale), p, deviation / scale)
 
 
 def long_run_sum(units: FloatArray, lags: int) -> float:
@@ -301,8 +298,7 @@ def lagged_products(outcomes: LogOutcomes, lag: int) -> tuple[FloatArray, float]
             continue
         unbroken = _unbroken(group.follows, lag)
         both = known[lag:] & known[:-lag] & unbroken[:, None]
-        size = group.mean * (1.0 - group.mean)
-        size = np.nan_to_num(size)
+        size = np.nan_to_num(group.mean * (1.0 - group.mean))
         # The mean is that of the same packets: products are smaller by its variance.
         lift = size / np.maximum(known.sum(axis=0), 1)
         units.append((z[lag:] * z[:-lag] * both + both * lift).sum(axis=1))
@@ -338,7 +334,7 @@ def fast_time(outcomes: LogOutcomes, parts: int) -> float:
 def test_time(outcomes: LogOutcomes) -> Test:
     """Test that a packet's outcome does not depend on that of the one before."""
     units, scale = lagged_products(outcomes, 1)
-    return _z_test("packets are independent in time", "correlation with the next", units, scale)
+    return _z_test("correlation with the next", units, scale)
 
 
 def test_memory(outcomes: LogOutcomes) -> Test:
@@ -360,7 +356,7 @@ def test_memory(outcomes: LogOutcomes) -> Test:
             scale += float((chosen.sum(axis=0) * size).sum())
         units.append(part.sum(axis=1))
     whole = np.concatenate([*units, np.empty(0)])
-    return _z_test("the last outcome is the state", "correlation given the last", whole, scale)
+    return _z_test("correlation given the last", whole, scale)
 
 
 class Share(NamedTuple):
@@ -399,9 +395,9 @@ def shared_fate(outcomes: LogOutcomes, lags: int) -> tuple[Share, Test]:
         near = group.follows[1:]
         lasting += float(((z[1:].sum(1) * z[:-1].sum(1) - (z[1:] * z[:-1]).sum(1)) * near).sum())
     S, D, G = (np.concatenate([*part, np.empty(0)]) for part in (sums, sizes, slopes))
-    name, what, scale = "hearers are independent", "share of one fate", float(D.sum())
+    what, scale = "share of one fate", float(D.sum())
     if scale <= 0.0 or alone <= 0.0 or len(S) < MIN_PACKETS:
-        return Share(np.nan, np.nan, np.nan), Test(name, what, np.nan, np.nan, np.nan)
+        return Share(np.nan, np.nan, np.nan), Test(what)
     share = float(S.sum()) / scale
     error = math.sqrt(long_run_sum(S - share * (D + G), lags)) / scale
     # Without shared fate; with bursts of each link neighbouring sums are correlated all the same.
@@ -409,7 +405,7 @@ def shared_fate(outcomes: LogOutcomes, lags: int) -> tuple[Share, Test]:
     unit = math.sqrt(alone * max(slack, 1.0)) / scale
     p_value = 2.0 * float(norm.sf(abs(share) / unit))
     rise = max(together / alone - 1.0, 0.0)
-    found = Test(name, what, share, p_value, unit, rise=rise)
+    found = Test(what, share, p_value, unit, rise=rise)
     return Share(share, error, 0.5 * lasting / scale), found
 
 
@@ -444,14 +440,14 @@ def _shrinkage(outcomes: LogOutcomes) -> float:
 def test_constancy(outcomes: LogOutcomes) -> Test:
     """Test by correlations of BLOCKS means that deliveries do not change slowly."""
     time = fast_time(outcomes, 3 * LAGS)
-    name, what = "quality does not change in time", "deviation of delivery over time"
+    what = "deviation of delivery over time"
     t = np.concatenate([group.t for group in outcomes.groups])
     z = np.concatenate([group.residuals.sum(axis=1) for group in outcomes.groups])
     n = np.concatenate([np.isfinite(group.x).sum(axis=1) for group in outcomes.groups])
     longest = max(len(group.t) for group in outcomes.groups)
     blocks = int(min(BLOCKS, len(t) // 8, longest / (5.0 * time)))
     if blocks < 3 * LAGS:
-        return Test(name, what, np.nan, np.nan, np.nan)
+        return Test(what)
     rank = np.argsort(np.argsort(t, kind="stable"), kind="stable")
     block = rank * blocks // len(t)
     sums, packets = np.bincount(block, z, blocks), np.bincount(block, n, blocks)
@@ -459,7 +455,7 @@ def test_constancy(outcomes: LogOutcomes) -> Test:
     r = r - r.mean()
     square = float(r @ r)
     if square <= 0.0:
-        return Test(name, what, 0.0, 1.0, np.nan)
+        return Test(what, 0.0, 1.0)
     lag = np.arange(1, LAGS + 1)
     # Residuals of a mean sum to 0, which makes each correlation -1 / blocks by chance.
     rho = np.array([r[k:] @ r[:-k] for k in lag]) / square + 1.0 / blocks
@@ -469,14 +465,11 @@ def test_constancy(outcomes: LogOutcomes) -> Test:
     # Slow changes that are the share s of the variance of blocks make each correlation s.
     unit = deviation * (LAGS * blocks) ** -0.25
     p = float(chi2.sf(statistic, LAGS))
-    return Test(name, what, deviation * math.sqrt(slow), p, unit, LAGS, 4)
+    return Test(what, deviation * math.sqrt(slow), p, unit, LAGS, 4)
 
 
-def test_identical(
-    assumption: str, counts: FloatArray, expected: FloatArray, spread: FloatArray, used: int
-) -> Test:
-    """Test that deliveries, by packets and those heard ``counts`` (K, 2), are the ``expected``
-    (K,).
+def test_identical(counts: FloatArray, expected: FloatArray, spread: FloatArray, used: int) -> Test:
+    """Test that deliveries, by packets and those heard ``counts`` (K, 2), are ``expected`` (K,).
 
     ``spread`` (K,) are the eigenvalues of the covariance of their standardised residuals, of which
     ``used`` are taken by estimated parameters.
@@ -485,7 +478,7 @@ def test_identical(
     variance = expected * (1.0 - expected) / np.maximum(counts[:, 0], 1.0)
     usable = (variance > 0.0) & (counts[:, 0] > 0.0)
     if usable.sum() <= used:
-        return Test(assumption, what, np.nan, np.nan, np.nan)
+        return Test(what)
     off = counts[usable, 1] / counts[usable, 0] - expected[usable]
     square, size = float((off**2 / variance[usable]).sum()), float(variance[usable].mean())
     share = (usable.sum() - used) / len(spread)
@@ -495,7 +488,7 @@ def test_identical(
     excess = max(square - mean, 0.0) / usable.sum()
     unit = math.sqrt(scale * size / usable.sum())
     p = float(chi2.sf(square / scale, freedom))
-    return Test(assumption, what, math.sqrt(excess * size), p, unit, freedom)
+    return Test(what, math.sqrt(excess * size), p, unit, freedom)
 
 
 def residual_spread(outcomes: LogOutcomes, share: float, time: float) -> FloatArray:
@@ -506,8 +499,7 @@ def residual_spread(outcomes: LogOutcomes, share: float, time: float) -> FloatAr
     return time * np.concatenate(parts)
 
 
-@dataclass(frozen=True, eq=False)
-class FittedChain:
+class FittedChain(NamedTuple):
     """A Gilbert-Elliott chain that all links follow: ``values`` to_bad, to_good, deliver_good,
     deliver_bad; ``cov`` (4, 4) of their logits; ``likelihood`` the logarithm.
     """
@@ -516,17 +508,14 @@ class FittedChain:
     cov: FloatArray
     likelihood: float
 
-    def draw(self, random: np.random.Generator) -> FloatArray:
-        """Return values drawn from their posterior, which is Gaussian in logits."""
-        return expit(random.multivariate_normal(logit(self.values), self.cov))
-
 
 def fit_chain(outcomes: LogOutcomes) -> FittedChain:
     """Return the chain of two states that makes the outcomes likeliest, links alike."""
     stretches = _pad_stretches(outcomes)
     count, heard = outcomes.counts.sum(axis=0)
     p = (heard + 0.5) / (count + 1.0)
-    first = [_sum_of(outcomes, lag) for lag in (1, 2)]
+    lagged = [lagged_products(outcomes, lag) for lag in (1, 2)]
+    first = [float(units.sum() / scale) if scale > 0.0 else 0.0 for units, scale in lagged]
     keep = min(max(first[1] / first[0] if first[0] > 0.0 else 0.5, 0.1), 0.99)
     best = None
     for good, bad in ((0.98, 0.02), (min(p + 0.1, 0.98), max(p - 0.3, 0.02))):
@@ -544,11 +533,6 @@ def fit_chain(outcomes: LogOutcomes) -> FittedChain:
     if values[2] < values[3]:  # the states changed their names
         x = x[[1, 0, 3, 2]]
     return FittedChain(expit(x), _inverse_curvature(x, stretches), -float(best.fun))
-
-
-def _sum_of(outcomes: LogOutcomes, lag: int) -> float:
-    units, scale = lagged_products(outcomes, lag)
-    return float(units.sum() / scale) if scale > 0.0 else 0.0
 
 
 def _pad_stretches(outcomes: LogOutcomes) -> np.ndarray:
@@ -590,7 +574,7 @@ def _inverse_curvature(x: FloatArray, stretches: np.ndarray) -> FloatArray:
     H = np.zeros((size, size))
     base, unit = _surprise(x, stretches), step * np.eye(size)
     ahead = [_surprise(x + unit[i], stretches) for i in range(size)]
-    for i, j in _pairs(size):
+    for j, i in combinations_with_replacement(range(size), 2):
         if i == j:
             H[i, i] = (ahead[i] - 2.0 * base + _surprise(x - unit[i], stretches)) / step**2
         else:
@@ -598,10 +582,6 @@ def _inverse_curvature(x: FloatArray, stretches: np.ndarray) -> FloatArray:
             H[i, j] = H[j, i] = (both - ahead[i] - ahead[j] + base) / step**2
     values, vectors = np.linalg.eigh(H)
     return np.asarray((vectors / (np.maximum(values, 0.0) + 0.25)) @ vectors.T)
-
-
-def _pairs(size: int) -> Iterator[tuple[int, int]]:
-    return ((i, j) for i in range(size) for j in range(i + 1))
 
 
 def fit_distance(

@@ -71,9 +71,7 @@ EXPORTED = "# netkf: "  # the log of a run begins so
 
 
 class _Rows(NamedTuple):
-    """Rows of all packet tables, in their order: ``where`` is file and line, ``what`` "tx", "rx" or
-    "outcome"; stamps are exact; heard is 1, 0 or nan.
-    """
+    """Rows with ``where`` (file, line), ``what`` ("tx", "rx", "outcome") and heard (1, 0, nan)."""
 
     table: pd.DataFrame
     stamps: list[Decimal]
@@ -87,23 +85,23 @@ def read_tables(log: Path, columns: Mapping[str, str]) -> PacketLog:
     """
     notes: list[str] = []
     tables = _rename({path: read_text_rows(path) for path in _packet_paths(log)}, columns)
-    rows = _join([_read_rows(path, raw, notes) for path, raw in tables.items()])
+    parts = [_read_rows(path, raw, notes) for path, raw in tables.items()]
+    stamps = [stamp for part in parts for stamp in part.stamps]
+    arrivals = [arrival for part in parts for arrival in part.arrivals]
     extras = {name: find_extra(log, name) for name in EXTRAS}
-    resolution = find_resolution(rows.stamps)
+    resolution = find_resolution(stamps)
     # A run counts from 0.
     is_run = (log / "scenario.toml").is_file()
-    origin = Decimal(0) if is_run else choose_origin(rows.stamps, resolution)
-    table = rows.table.assign(t=[float(stamp - origin) for stamp in rows.stamps])
+    origin = Decimal(0) if is_run else choose_origin(stamps, resolution)
+    table = pd.concat([part.table for part in parts], ignore_index=True)
+    table["t"] = [float(stamp - origin) for stamp in stamps]
     falls = -np.minimum(np.diff(table["t"]), 0.0)
     if falls.any():
         count = count_phrase(int(np.count_nonzero(falls)), "time")
         notes.append(f"sorted: stamps fall from row to row {count}, by up to {falls.max():g} s")
-    delays = [
-        np.nan if b is None else float(b - a)
-        for a, b in zip(rows.stamps, rows.arrivals, strict=True)
-    ]
-    table = table.assign(delay=delays)
-    early = np.flatnonzero(np.array(delays) < 0.0)
+    pairs = zip(stamps, arrivals, strict=True)
+    table["delay"] = [np.nan if b is None else float(b - a) for a, b in pairs]
+    early = np.flatnonzero(table["delay"] < 0.0)
     if early.size:
         where = table["where"].iloc[early[0]]
         rule = f"{where}: is heard before it is sent"
@@ -304,12 +302,6 @@ def _read_outcomes(
     refuse_rows(path, receiver, alone, "must name a receiver", remedy, quoted=False)
     refuse_rows(path, sender, receiver == sender, "sender and receiver must differ", remedy)
     return what, heard
-
-
-def _join(parts: list[_Rows]) -> _Rows:
-    table = pd.concat([part.table for part in parts], ignore_index=True)
-    stamps = [stamp for part in parts for stamp in part.stamps]
-    return _Rows(table, stamps, [arrival for part in parts for arrival in part.arrivals])
 
 
 def _match(
@@ -523,7 +515,11 @@ def read_log_positions(path: Path, origin: Decimal, notes: list[str]) -> pd.Data
     stamps = parse_stamps(path, raw, stamp) if stamp else [origin] * len(raw)
     times = [float(s - origin) for s in stamps]
     table = pd.DataFrame({"t": times, "node": raw[name].to_numpy(), **columns}, index=raw.index)
-    _refuse_two_positions(path, table, "one position" + (" at a time" if stamp else ""))
+    for (_, node), rows in table.drop_duplicates(["t", "node", "x", "y"]).groupby(["t", "node"]):
+        if len(rows) > 1:
+            what = "one position at a time" if stamp else "one position"
+            rule = f"lines {rows.index[0]} and {rows.index[1]}: a node must have {what}"
+            raise ScenarioError(str(path), rule, str(node), "correct one of the two rows")
     kept = table.drop_duplicates(["t", "node"]).sort_values(["t", "node"], kind="stable")
     note_count(notes, len(table) - len(kept), "row", "merged: {} of " + path.name)
     # The first place of a node that was placed later counts from the beginning.
@@ -533,27 +529,17 @@ def read_log_positions(path: Path, origin: Decimal, notes: list[str]) -> pd.Data
     return kept.reset_index(drop=True) if stamp else kept.drop(columns="t")
 
 
-def _refuse_two_positions(path: Path, table: pd.DataFrame, what: str) -> None:
-    for (_, node), rows in table.groupby(["t", "node"]):
-        places = rows.drop_duplicates(["x", "y"])
-        if len(places) > 1:
-            rule = f"lines {places.index[0]} and {places.index[1]}: a node must have {what}"
-            raise ScenarioError(str(path), rule, str(node), "correct one of the two rows")
-
-
-def read_readings(path: Path, origin: Decimal, notes: list[str], column: str = "") -> pd.DataFrame:
-    """Return t (s from ``origin``), node, y0 of a ``column`` or the first (ScenarioError)."""
+def read_readings(path: Path, origin: Decimal, notes: list[str]) -> pd.DataFrame:
+    """Return t (s from ``origin``), node, y0, the first other column; raises ScenarioError."""
     raw = read_text_rows(path)
     stamp, node = find_column(raw, "t"), find_column(raw, "node") or find_column(raw, "sender")
     rest = [name for name in raw.columns if name not in (stamp, node)]
     if not stamp or not node or not rest:
         rule = "must have columns t, node and y0"
         raise ScenarioError(str(path), rule, list(raw.columns), "name the columns")
-    stamps, used = parse_stamps(path, raw, stamp), column or rest[0]
-    values = parse_numbers(path, raw, used, gaps=True)
+    stamps, (used, *unused) = parse_stamps(path, raw, stamp), rest
     table = pd.DataFrame({"t": [float(s - origin) for s in stamps], "node": raw[node].to_numpy()})
-    table["y0"] = values
-    unused = [name for name in rest if name != used]
+    table["y0"] = parse_numbers(path, raw, used, gaps=True)
     if unused:
         notes.append(f"not used: {path.name}: columns {', '.join(unused)}, but {used} as y0")
     is_empty, is_early = table["y0"].isna(), table["t"] < 0.0

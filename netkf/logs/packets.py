@@ -269,9 +269,7 @@ def unwrap(numbers: np.ndarray, times: FloatArray) -> tuple[np.ndarray, int, int
 def _cycles_begun(
     coming: np.ndarray, last: int, expected: float, modulus: int, cycle: int, wrapped: bool
 ) -> int:
-    """Return how many cycles of a counter began between ``last`` and the first of the numbers
-    ``coming``, in a time of ``expected`` packets; RESTART if it began anew.
-    """
+    """Return how many cycles began between ``last`` and ``coming``; RESTART if it began anew."""
     number = int(coming[0])
     skipped = number + modulus - last
     turns = _whole_turns(skipped, expected, cycle)
@@ -342,9 +340,10 @@ def settle(log: PacketLog, hole: float, unreported: str) -> pd.DataFrame:
         why[missing] = ""
         silent = missing & ~sends["sent"].to_numpy(dtype=bool)[send]
         if unreported == "unknown":
-            why[silent] = np.where(_sent_all_that_was_heard(sends)[send], NOT_LOGGED, UNREPORTED)[
-                silent
-            ]
+            # Of senders that logged all that anybody heard.
+            known = sends[sends["sent"].astype(bool)].groupby("sender")["logged"].all()
+            logs_all = sends["sender"].map(known).fillna(False).to_numpy(dtype=bool)
+            why[silent] = np.where(logs_all[send[silent]], NOT_LOGGED, UNREPORTED)
         text = "not known: {} of transmissions that nobody reported, of which only their numbers "
         note_count(log.notes, silent.sum(), "outcome", f"{text}tell; taken as {unreported}")
         why[_in_holes(log, whole, hole)] = "the receiver's log has a hole"
@@ -353,12 +352,6 @@ def settle(log: PacketLog, hole: float, unreported: str) -> pd.DataFrame:
     whole["why"] = why
     columns = ["send", "receiver", "heard", "delay", "rssi", "why"]
     return whole.sort_values(["send"], kind="stable")[columns].reset_index(drop=True)
-
-
-def _sent_all_that_was_heard(sends: pd.DataFrame) -> np.ndarray:
-    """Return flags of transmissions whose sender logged all that anybody heard."""
-    known = sends[sends["sent"].astype(bool)].groupby("sender")["logged"].all()
-    return sends["sender"].map(known).fillna(False).to_numpy(dtype=bool)
 
 
 def _in_holes(log: PacketLog, whole: pd.DataFrame, hole: float) -> np.ndarray:

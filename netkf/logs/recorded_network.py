@@ -185,12 +185,8 @@ def _outcome_tables(log: PacketLog, outcomes: pd.DataFrame) -> tuple[pd.DataFram
     is_known = table["delivered"].notna()
     unknown = table[~is_known].drop(columns=["delivered", "rssi", "delay"])
     table = table[is_known].drop(columns="why").astype({"delivered": int})
-    untold = [c for c in ("rssi", "channel") if not _is_stated(table[c])]
+    untold = [c for c in ("rssi", "channel") if not (table[c].notna() & (table[c] != "")).any()]
     return table.drop(columns=untold), unknown.drop(columns=[c for c in untold if c == "channel"])
-
-
-def _is_stated(column: pd.Series) -> bool:
-    return bool((column.notna() & (column != "")).any())
 
 
 def _own_scenario(
