@@ -151,12 +151,8 @@ def create_output_directory(requested: Path | None, name: str, option: str = "--
         return next(path for path in paths if make_directory(path, must_be_new=True))
     make_directory(requested, option=option)
     if any(requested.iterdir()):
-        raise ScenarioError(
-            option,
-            "must be a new or empty directory",
-            str(requested),
-            "choose another, or remove it first",
-        )
+        rule = "must be a new or empty directory"
+        raise ScenarioError(option, rule, str(requested), "choose another, or remove it first")
     return requested
 
 

@@ -86,34 +86,25 @@ def _check_times(scenario: DerivedScenario) -> None:
         rule, remedy = f"must make at most {MAX_STEPS:,} steps to the horizon", "lengthen it"
         raise ScenarioError("plant.step", rule, plant.step, remedy)
     if scenario.slotted and horizon / scenario.slot_plant.period > MAX_STEPS:
-        raise ScenarioError(
-            "plant.period",
-            f"must make at most {MAX_STEPS:,} slots to the horizon",
-            scenario.slot_plant.period,
-            f"lengthen it or shorten the horizon; {UNIX}",
-        )
+        rule = f"must make at most {MAX_STEPS:,} slots to the horizon"
+        remedy = f"lengthen it or shorten the horizon; {UNIX}"
+        raise ScenarioError("plant.period", rule, scenario.slot_plant.period, remedy)
     if not isinstance(probe, np.ndarray):
         if probe > horizon:
             raise ScenarioError(
                 "probe", f"must be at most the horizon {horizon:.15g}", probe, "shorten the period"
             )
         if horizon / probe > MAX_SAMPLES:
-            raise ScenarioError(
-                "probe",
-                f"must ask for at most {MAX_SAMPLES:,} samples",
-                probe,
-                f"lengthen the period or shorten the horizon; {UNIX}",
-            )
+            rule = f"must ask for at most {MAX_SAMPLES:,} samples"
+            remedy = f"lengthen the period or shorten the horizon; {UNIX}"
+            raise ScenarioError("probe", rule, probe, remedy)
         _check_entries(scenario, horizon / probe)
         return
     outside = probe[(probe < 0.0) | (probe > horizon)]
     if outside.size:
-        raise ScenarioError(
-            "probe",
-            f"times must lie in [0, {horizon:.15g}]",
-            outside[0].item(),
-            "lengthen the horizon, or leave it out",
-        )
+        rule = f"times must lie in [0, {horizon:.15g}]"
+        remedy = "lengthen the horizon, or leave it out"
+        raise ScenarioError("probe", rule, outside[0].item(), remedy)
     if (np.diff(probe) <= 0.0).any():
         raise ScenarioError("probe", "times must be strictly increasing", probe, "sort them")
     _check_entries(scenario, len(probe))
@@ -187,12 +178,9 @@ def _check_sensors(scenario: DerivedScenario) -> None:
                     f"{key}.nodes[{position}]", "must be a node of the graph", node, remedy
                 )
         if len(set(sensor.nodes)) < len(sensor.nodes):
-            raise ScenarioError(
-                f"{key}.nodes",
-                "must name each node once",
-                list(sensor.nodes),
-                "write a second [[sensors]] entry for a second sensor",
-            )
+            rule = "must name each node once"
+            remedy = "write a second [[sensors]] entry for a second sensor"
+            raise ScenarioError(f"{key}.nodes", rule, list(sensor.nodes), remedy)
 
 
 def _largest_information(sensor: Any) -> float:
@@ -223,12 +211,8 @@ def _check_speed(scenario: DerivedScenario) -> None:
         )
     growth = growth_rate(A) * scenario.horizon
     if growth > MAX_GROWTH:
-        raise ScenarioError(
-            "plant.A",
-            f"must grow by at most e^{MAX_GROWTH:g} up to the horizon",
-            A,
-            "shorten the horizon",
-        )
+        rule = f"must grow by at most e^{MAX_GROWTH:g} up to the horizon"
+        raise ScenarioError("plant.A", rule, A, "shorten the horizon")
 
 
 def _pauses_increments(scenario: DerivedScenario) -> bool:
@@ -370,22 +354,14 @@ def _check_network(scenario: DerivedScenario) -> None:
     name = filter_name(scenario)
     if network.activation is None:
         example = "broadcast" if scenario.slotted else "poisson"
-        raise ScenarioError(
-            "network.activation",
-            f"is missing, and the {name} talks",
-            None,
-            f'add activation = {{ kind = "{example}", ... }}',
-        )
+        remedy = f'add activation = {{ kind = "{example}", ... }}'
+        raise ScenarioError("network.activation", f"is missing, and the {name} talks", None, remedy)
     if not scenario.slotted:
         check_activation(scenario)
         _check_ticks(scenario)
     elif topology.directed and not node_filter.needs.one_way:
-        raise ScenarioError(
-            "network.graph.directed",
-            f"must be false for the {name}, whose links work both ways in slots",
-            True,
-            "give an undirected graph",
-        )
+        rule = f"must be false for the {name}, whose links work both ways in slots"
+        raise ScenarioError("network.graph.directed", rule, True, "give an undirected graph")
     one_way = node_filter.needs.one_way or topology.directed
     if len(topology.components) > 1 and not one_way:
         smallest_component = sorted(topology.components[-1])
@@ -422,19 +398,11 @@ def _check_filter(scenario: DerivedScenario) -> None:
     ):
         if isinstance(value, tuple):
             if len(value) != len(scenario.nodes):
-                raise ScenarioError(
-                    key,
-                    f"must have one entry for each of {len(scenario.nodes)} nodes",
-                    f"{len(value)} entries",
-                    "add or remove some",
-                )
+                rule = f"must have one entry for each of {len(scenario.nodes)} nodes"
+                raise ScenarioError(key, rule, f"{len(value)} entries", "add or remove some")
             if algorithm.timing.pooled:
-                raise ScenarioError(
-                    key,
-                    "must be one for the filter that all nodes share",
-                    f"{len(value)} entries",
-                    "give one",
-                )
+                rule = "must be one for the filter that all nodes share"
+                raise ScenarioError(key, rule, f"{len(value)} entries", "give one")
             for k, item in enumerate(value):
                 require_shape(f"{key}[{k}]", item, shape, why)
         elif value is not None:
@@ -448,12 +416,9 @@ def _check_filter(scenario: DerivedScenario) -> None:
             rule = "means nothing with a nonlinear plant, whose f filters know"
             raise ScenarioError(f"filter.model.{name}", rule, value, "leave it out")
         if (name in "FQ") != scenario.slotted:
-            raise ScenarioError(
-                f"filter.model.{name}",
-                explain_time_mismatch(scenario.slotted),
-                value,
-                "use F and Q for linear plants, A and B for diffusions",
-            )
+            rule = explain_time_mismatch(scenario.slotted)
+            remedy = "use F and Q for linear plants, A and B for diffusions"
+            raise ScenarioError(f"filter.model.{name}", rule, value, remedy)
         require_shape(f"filter.model.{name}", value, (n, None if name == "B" else n), why)
     if scenario.tells_models and algorithm.kernels is not None:
         raise ScenarioError(
@@ -474,12 +439,8 @@ def _check_believed_noise(scenario: DerivedScenario) -> None:
     if R is None:
         return
     if isinstance(R, tuple) and len(R) != len(sensors):
-        raise ScenarioError(
-            "filter.model.R",
-            f"must have one entry for each of {len(sensors)} [[sensors]]",
-            f"{len(R)} entries",
-            "add or remove some",
-        )
+        rule = f"must have one entry for each of {len(sensors)} [[sensors]]"
+        raise ScenarioError("filter.model.R", rule, f"{len(R)} entries", "add or remove some")
     for k, sensor in enumerate(sensors):
         if sensor.record is not None and sensor.record.has_noise:
             raise ScenarioError(
@@ -502,31 +463,21 @@ def _check_degrees(scenario: DerivedScenario) -> None:
         return
     node, degree = max(scenario.topology.degrees.items(), key=lambda item: item[1])
     if degree > algorithm.link_weights.largest_degree:
-        raise ScenarioError(
-            "filter.epsilon",
-            f"must be at most 1 / {degree}, because node {node} has {degree} links",
-            getattr(algorithm, "epsilon", None),
-            f"give at most {1.0 / degree:.6g}",
-        )
+        rule = f"must be at most 1 / {degree}, because node {node} has {degree} links"
+        remedy = f"give at most {1.0 / degree:.6g}"
+        raise ScenarioError("filter.epsilon", rule, getattr(algorithm, "epsilon", None), remedy)
 
 
 def _check_sensing_period(scenario: DerivedScenario) -> None:
     period, horizon = scenario.diffusion.sensing_period, scenario.horizon
     assert period is not None
     if horizon / period > MAX_STEPS:
-        raise ScenarioError(
-            "plant.sensing_period",
-            f"must make at most {MAX_STEPS:,} steps to the horizon",
-            period,
-            "lengthen it, shorten the horizon, or use less precise sensors",
-        )
+        rule = f"must make at most {MAX_STEPS:,} steps to the horizon"
+        remedy = "lengthen it, shorten the horizon, or use less precise sensors"
+        raise ScenarioError("plant.sensing_period", rule, period, remedy)
     if period > scenario.diffusion.longest_period * (1.0 + 1e-9):
-        raise ScenarioError(
-            "plant.sensing_period",
-            "is too long for the plant",
-            period,
-            f"give at most {scenario.diffusion.longest_period:.3g}, or leave it out",
-        )
+        remedy = f"give at most {scenario.diffusion.longest_period:.3g}, or leave it out"
+        raise ScenarioError("plant.sensing_period", "is too long for the plant", period, remedy)
     check_changes_on_grid(scenario, period)
     distinct_models = {
         id(model): model for models in scenario.model_pieces for model in models if len(model.H)
@@ -536,12 +487,9 @@ def _check_sensing_period(scenario: DerivedScenario) -> None:
     if min(period, horizon) <= longest * (1.0 + 1e-9):
         return
     if getattr(scenario.plant, "sensing_period", None) is not None:
-        raise ScenarioError(
-            "plant.sensing_period",
-            "is too long for the readings of the most precise node",
-            period,
-            f"give at most {longest:.3g}, or leave it out",
-        )
+        rule = "is too long for the readings of the most precise node"
+        remedy = f"give at most {longest:.3g}, or leave it out"
+        raise ScenarioError("plant.sensing_period", rule, period, remedy)
     raise ScenarioError(
         "filter.model",
         f"is too far from the truth: it needs readings every {longest:.3g} s, the sensors give "
@@ -559,12 +507,9 @@ def _check_slots(scenario: DerivedScenario) -> None:
         if abs(t - k * plant.period) > 1e-9 * max(plant.period, t)
     ]
     if times_off_slots:
-        raise ScenarioError(
-            "probe",
-            f"times must be multiples of the plant's period {plant.period:.15g}",
-            times_off_slots[0],
-            "sample at slots only, with all digits of the period",
-        )
+        rule = f"times must be multiples of the plant's period {plant.period:.15g}"
+        remedy = "sample at slots only, with all digits of the period"
+        raise ScenarioError("probe", rule, times_off_slots[0], remedy)
     activation = scenario.network.activation
     if not node_filter.timing.talks:
         return
@@ -582,12 +527,9 @@ def _check_slots(scenario: DerivedScenario) -> None:
         )
     exchanges = (node_filter.timing.schedule or ()).count("exchange")
     if exchanges * scenario.phase_length >= plant.period * (1.0 - 1e-9):
-        raise ScenarioError(
-            "network.activation.phase",
-            f"must leave {exchanges} exchange(s) room within the period {plant.period:g}",
-            scenario.phase_length,
-            "shorten it; the steps of an exchange share it",
-        )
+        rule = f"must leave {exchanges} exchange(s) room within the period {plant.period:g}"
+        remedy = "shorten it; the steps of an exchange share it"
+        raise ScenarioError("network.activation.phase", rule, scenario.phase_length, remedy)
 
 
 def _describe_activation(activation: Component) -> str:

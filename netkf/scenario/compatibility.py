@@ -52,12 +52,9 @@ def check_activation(scenario: DerivedScenario) -> None:
         remedies = [
             f'at = "{at}"' for at in ("directions", "nodes") if at in node_filter.timing.clocks
         ]
-        raise ScenarioError(
-            "network.graph.directed",
-            f"must be false for the {name} at links, which work both ways",
-            True,
-            " or ".join(["give an undirected graph", *remedies]),
-        )
+        rule = f"must be false for the {name} at links, which work both ways"
+        remedy = " or ".join(["give an undirected graph", *remedies])
+        raise ScenarioError("network.graph.directed", rule, True, remedy)
     if clock.at not in node_filter.timing.clocks:
         clocks, at = node_filter.timing.clocks, clock.at
         settings = [f'at = "{one}"' for one in clocks if one != "readings"]
@@ -71,9 +68,6 @@ def check_activation(scenario: DerivedScenario) -> None:
     # A filter that needs samples says so itself, of the sensors that there are.
     says_so = bool(scenario.sensors) and node_filter.needs.samples
     if clock.at == "readings" and not says_so and not any(map(takes_samples, scenario.sensors)):
-        raise ScenarioError(
-            "network.activation.kind",
-            "needs a sensor that takes samples, and there is none",
-            "readings",
-            f"add {SAMPLING} to a sensor, or choose clocks",
-        )
+        rule = "needs a sensor that takes samples, and there is none"
+        remedy = f"add {SAMPLING} to a sensor, or choose clocks"
+        raise ScenarioError("network.activation.kind", rule, "readings", remedy)

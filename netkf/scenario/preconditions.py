@@ -184,12 +184,8 @@ def _check_increments(scenario: DerivedScenario) -> None:
     name = filter_name(scenario)
     for k, sensor in enumerate(scenario.sensors):
         if scenario.node_filter.needs.samples and not takes_samples(sensor):
-            raise ScenarioError(
-                f"{scenario.sensor_key(k)}.sampling",
-                f"is missing, and the {name} uses samples, no continuous increments",
-                None,
-                f"add {SAMPLING}",
-            )
+            rule = f"is missing, and the {name} uses samples, no continuous increments"
+            raise ScenarioError(f"{scenario.sensor_key(k)}.sampling", rule, None, f"add {SAMPLING}")
 
 
 def _check_fixed_sensors(scenario: DerivedScenario) -> None:

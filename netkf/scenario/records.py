@@ -77,12 +77,9 @@ def check_records(scenario: DerivedScenario) -> None:
         elif scenario.unknown[support_of(sensor, scenario.plant.n)].any() or (
             not scenario.plant.truth_known
         ):
-            raise ScenarioError(
-                f"{key}.kind",
-                "must be recorded where the plant's state is unknown",
-                None,
-                'write kind = "recorded" and path = "readings.csv"',
-            )
+            rule = "must be recorded where the plant's state is unknown"
+            remedy = 'write kind = "recorded" and path = "readings.csv"'
+            raise ScenarioError(f"{key}.kind", rule, None, remedy)
     for (key, plant), place in zip(scenario.all_plants, scenario.layout.places, strict=True):
         if scenario.links_follow_state and scenario.unknown[place.entries].any():
             rule = "must be drawn or recorded, since links follow positions"

@@ -256,12 +256,8 @@ def _require_part(family: str, kind: str, cls: Any) -> type[Component] | None:
         return None
     base = FAMILIES[family]
     if not (isinstance(cls, type) and issubclass(cls, base)):
-        raise ScenarioError(
-            "kind",
-            f"must be a subclass of netkf's {base.__name__}",
-            kind,
-            f"derive the class from {base.__module__}.{base.__name__}",
-        )
+        remedy = f"derive the class from {base.__module__}.{base.__name__}"
+        raise ScenarioError("kind", f"must be a subclass of netkf's {base.__name__}", kind, remedy)
     missing = sorted(
         name
         for name in dir(cls)

@@ -144,21 +144,15 @@ def check_sampling(scenario: ScenarioModel) -> None:
             if sensor.sampling is not None:
                 _check_clock(scenario, key, sensor)
             elif not sensor.linear and not scenario.slotted and sensor.record is None:
-                raise ScenarioError(
-                    f"{key}.sampling",
-                    "is missing, and a nonlinear sensor takes samples in continuous time",
-                    None,
-                    'write sampling = { kind = "periodic", period = ... }',
-                )
+                rule = "is missing, and a nonlinear sensor takes samples in continuous time"
+                remedy = 'write sampling = { kind = "periodic", period = ... }'
+                raise ScenarioError(f"{key}.sampling", rule, None, remedy)
         has_increments = scenario.plant.is_random and scenario.plant.linear
         if not scenario.slotted and not has_increments and not takes_samples(sensor):
             kind = "recorded" if scenario.plant.linear else "nonlinear"
-            raise ScenarioError(
-                f"{key}.sampling",
-                f"must be a clock, since increments of a {kind} state are unknown",
-                None,
-                'write sampling = { kind = "periodic", period = ... }',
-            )
+            rule = f"must be a clock, since increments of a {kind} state are unknown"
+            remedy = 'write sampling = { kind = "periodic", period = ... }'
+            raise ScenarioError(f"{key}.sampling", rule, None, remedy)
     if not scenario.slotted and scenario.plant.record is not None:
         streams = Streams(scenario.seed)
         require_states(scenario, sample_times(scenario, streams), streams)
@@ -168,12 +162,9 @@ def _check_clock(scenario: ScenarioModel, key: str, sensor: LinearSensor | Nonli
     clock = sensor.sampling
     assert clock is not None
     if scenario.slotted:
-        raise ScenarioError(
-            f"{key}.sampling",
-            "belongs to plants in continuous time, and this plant is in slots",
-            None,
-            "leave it out: there is a reading in every slot",
-        )
+        rule = "belongs to plants in continuous time, and this plant is in slots"
+        remedy = "leave it out: there is a reading in every slot"
+        raise ScenarioError(f"{key}.sampling", rule, None, remedy)
     if isinstance(clock, RecordedSampling):
         for node in clock.listed:
             if node not in scenario.topology.index:
@@ -182,12 +173,8 @@ def _check_clock(scenario: ScenarioModel, key: str, sensor: LinearSensor | Nonli
                 raise ScenarioError(f"{key}.sampling.path", rule, node, remedy)
     # Sampling clocks are of the same classes as clocks of links; these fields are for links only.
     if getattr(clock, "rates", ()):
-        raise ScenarioError(
-            f"{key}.sampling.rates",
-            "belongs to network.activation",
-            None,
-            "give rate, and another [[sensors]] entry for nodes with another one",
-        )
+        remedy = "give rate, and another [[sensors]] entry for nodes with another one"
+        raise ScenarioError(f"{key}.sampling.rates", "belongs to network.activation", None, remedy)
     if getattr(clock, "rate", 0.0) is None and getattr(clock, "rates", None) is not None:
         raise ScenarioError(f"{key}.sampling.rate", "is missing", None, "add rate = ...")
     if getattr(clock, "at", "links") != "links":

@@ -40,12 +40,9 @@ def check_schedule(scenario: DerivedScenario, why: str) -> None:
             continue
         period, start = scenario.slot_plant.period, float(plant.changes[k])
         if scenario.slot_plant.slot_time(round(start / period)) != start:
-            raise ScenarioError(
-                f"plant.schedule[{k}].from",
-                f"must be a multiple of plant.period = {period:.15g}, where a slot begins",
-                start,
-                f"give {period * round(start / period):.15g}",
-            )
+            rule = f"must be a multiple of plant.period = {period:.15g}, where a slot begins"
+            remedy = f"give {period * round(start / period):.15g}"
+            raise ScenarioError(f"plant.schedule[{k}].from", rule, start, remedy)
 
 
 def check_changes_on_grid(scenario: DerivedScenario, period: float) -> None:
@@ -65,12 +62,9 @@ def check_changes_on_grid(scenario: DerivedScenario, period: float) -> None:
 def check_regressor(scenario: DerivedScenario, key: str, sensor: RegressorSensor) -> None:
     """Raise ScenarioError for wrong shapes of a regressor at ``key``, or continuous time."""
     if not scenario.slotted:
-        raise ScenarioError(
-            f"{key}.kind",
-            "belongs to plants in slots (linear), and this plant is in continuous time",
-            "regressor",
-            "change the plant or use a linear sensor",
-        )
+        rule = "belongs to plants in slots (linear), and this plant is in continuous time"
+        remedy = "change the plant or use a linear sensor"
+        raise ScenarioError(f"{key}.kind", rule, "regressor", remedy)
     m, q = len(sensor.A), sensor.B.shape[1]
     why = f"{key}.A has {m} rows"
     require_shape(f"{key}.B", sensor.B, (m, None), why)

@@ -190,12 +190,9 @@ def check_grid(scenario: Any) -> None:
         rounding = abs(grid.instant(seconds) - seconds)
         is_held = rounding <= 1e-15 * seconds if exact is None else grid.holds(exact)
         if is_coarse and not is_held:
-            raise ScenarioError(
-                key,
-                f"must be a multiple of the resolution {given:g} of [time]",
-                seconds,
-                f"give a finer resolution, at least {least:g}, or leave it out",
-            )
+            rule = f"must be a multiple of the resolution {given:g} of [time]"
+            remedy = f"give a finer resolution, at least {least:g}, or leave it out"
+            raise ScenarioError(key, rule, seconds, remedy)
         if seconds > 0.0 and rounding * FAR > seconds:
             raise ScenarioError(
                 key,
