@@ -45,7 +45,7 @@ def _compare(options: argparse.Namespace) -> int:
         if options.out is not None:
             written = write_comparison(scenario, comparison, options.out)
             if not options.no_plot:
-                pictures.draw_picture(pictures.FILTERS, scenario, written)
+                pictures.draw_picture(pictures.FILTERS, scenario, comparison, written)
     finally:
         if options.json:
             print_json(comparison.document())

@@ -43,9 +43,9 @@ from netkf.studies.filter_values import (
     credibility,
     curve_rows,
     estimate_quantities,
-    join_values,
     mean_curve,
 )
+from netkf.studies.metrics import join_batches
 from netkf.trace.run import plot_by_name
 
 if TYPE_CHECKING:
@@ -232,7 +232,7 @@ def _simulate(
     )
     with explain_failures(candidate):
         found: FilterValues = replicate_blocks(
-            task, join_values, candidate, runs, seed, pool=pool, form=VALUES
+            task, join_batches, candidate, runs, seed, pool=pool, form=VALUES
         )
         return found
 
@@ -384,18 +384,10 @@ def _filter_table(scenario: Scenario, choice: Any) -> dict[str, Any]:
     return {**carried, **table}
 
 
-@dataclass(frozen=True, eq=False)
-class CompletedComparison:
-    """A comparison that was written to ``directory``."""
-
-    directory: Path
-    comparison: FilterComparison
-
-
 def write_comparison(
     scenario: Scenario, comparison: FilterComparison, out: Path | None = None
-) -> CompletedComparison:
-    """Write the files of a comparison into a new directory; raises ScenarioError."""
+) -> Path:
+    """Write the files of a comparison into a new directory, and return it; raises ScenarioError."""
     check_sources(scenario)
     directory = create_output_directory(out, f"{scenario.name}-filters")
     write_scenario(directory, scenario)
@@ -417,7 +409,7 @@ def write_comparison(
         "files": file_digests(directory, files),
     }
     write_sealed(directory / "manifest.json", manifest)
-    return CompletedComparison(directory, comparison)
+    return directory
 
 
 def _curve_columns(curves: Sequence[ErrorCurve]) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from netkf.runs.quantities import NETWORK, NetworkSink, with_network
 from netkf.runs.simulate import simulate
 from netkf.runs.summary import promise_traces
 from netkf.scenario.scenario import Scenario
-from netkf.studies.metrics import mean_over_runs
+from netkf.studies.metrics import join_batches, mean_over_runs
 
 JUDGED = ("rms_error", "worst_instant", "nees_ratio")
 """Quantities whose differences have intervals."""
@@ -78,12 +78,7 @@ def block_values(
         curves = squares_over_time(batch, rows)
         quantities = values.quantities[:, -1]
         parts.append(FilterValues(square, nees, quantities, values.diverged > 0, curves))
-    return join_values(*parts)
-
-
-def join_values(*parts: FilterValues) -> FilterValues:
-    """Return the values of several batches as one."""
-    return FilterValues(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+    return join_batches(*parts)
 
 
 def count_traffic(scenario: Scenario, seed: int, engine: Engine) -> dict[str, float]:

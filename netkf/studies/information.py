@@ -206,16 +206,7 @@ def _swap_flow(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -
     target = segment(messages.receiver, np.maximum(messages.used_row, 0))
     last = segment(nodes, np.full(len(nodes), rows))
     ends = dict(zip(nodes.tolist(), last.tolist(), strict=True))
-    return Flow(
-        messages=messages,
-        rows=rows,
-        node=node,
-        start=start,
-        origin=origin,
-        target=target,
-        cost=1 - used,
-        last=ends,
-    )
+    return Flow(messages, rows, node, start, origin, target, cost=1 - used, last=ends)
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,9 +317,7 @@ class KeptReadings:
         return self.reading_time(int(rows[k])) if k >= 0 and rows[k] >= start else np.nan
 
     def _last_up(self, node: int, start: int, end: int, time: float) -> float:
-        """Return when ``node`` was up last in rows ``start`` to ``end``, the last of which is at
-        ``time`` (s); nan if it was not.
-        """
+        """Return when ``node`` was up last in rows ``start`` to ``end``, which is at ``time`` s."""
         changes = self._changes.get(node, [])
         k = bisect.bisect_left(changes, (end, 0)) - 1
         if k < 0:
@@ -384,10 +373,7 @@ def newest_information(
 
 def _age_key(reading: float, known: float) -> tuple[float, float]:
     """Sort key, oldest first: time of the newest reading, then time up to which it is known."""
-    return (
-        -np.inf if np.isnan(reading) else reading,
-        np.inf if np.isnan(known) else known,
-    )
+    return -np.inf if np.isnan(reading) else reading, np.inf if np.isnan(known) else known
 
 
 def route(reach: BackwardSearch, segment: int, budget: int) -> tuple[int, ...]:

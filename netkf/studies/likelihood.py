@@ -31,7 +31,6 @@ from netkf.linalg.small import add_matmul, matmul
 from netkf.plants.transitions import Transitions
 from netkf.runs.readings import RunReadings, collect_readings
 from netkf.runs.simulate import require_scenario
-from netkf.scenario.model import PlacedSensor
 from netkf.scenario.scenario import Scenario
 from netkf.trace.nees import BLUR, ROUNDING
 
@@ -135,8 +134,10 @@ class CentralModel:
         """Lay out scalar readings: those of a noise that is not diagonal are decorrelated."""
         index = {(v.entry, row): k for k, v in enumerate(self.variances) for row in v.rows}
         H, of, owners = [], [], []
+        # How many values each linear sensor reads.
+        rows = [len(sensor.matrix_of(scenario.plant.n)) for sensor in scenario.sensors]
         first = {
-            (node, one.ordinal): sum(_rows_of(scenario, before) for before in placed[:k])
+            (node, one.ordinal): sum(rows[before.entry] for before in placed[:k])
             for node, placed in scenario.placed_sensors.items()
             for k, one in enumerate(placed)
         }
@@ -218,14 +219,10 @@ class CentralModel:
         )  # fmt: skip
 
 
-def _rows_of(scenario: Scenario, placed: PlacedSensor) -> int:
-    """Return the number of values that a linear sensor reads."""
-    return len(scenario.sensors[placed.entry].matrix_of(scenario.plant.n))
-
-
 def _require_central(scenario: Scenario) -> None:
     plant, leave_out = scenario.plant, "leave it out"
     increments = "must take samples: increments have no density of their own"
+    changes = "cannot be here: the noise of one model is fitted"
     linear = "must be linear, as the Kalman filter whose likelihood is fitted"
     lives = "cannot be here: the likelihood is that of all readings, also of nodes that are down"
     clocks = "cannot be here: the likelihood is that of readings with right stamps"
@@ -234,12 +231,7 @@ def _require_central(scenario: Scenario) -> None:
         (not plant.linear, "plant", linear, "write a linear plant that is close to it"),
         (not scenario.has_linear_sensors, "sensors", linear, "leave the others out"),
         (scenario.increment_sensors, "sensors", increments, "write sampling = { kind = ... }"),
-        (
-            len(plant.changes),
-            "plant.schedule",
-            "cannot be here: the noise of one model is fitted",
-            "fit each part of the run by itself",
-        ),
+        (len(plant.changes), "plant.schedule", changes, "fit each part of the run by itself"),
         (scenario.network.lives, "network.lives", lives, leave_out),
         (scenario.network.clocks, "network.clocks", clocks, leave_out),
         (scenario.misses_input, "filter.model.input", unknown, leave_out),
@@ -366,10 +358,7 @@ def _central_model(scenario: Scenario, seed: int | None, replica: int) -> Centra
 
 
 def fit_noise(
-    scenario: Scenario,
-    seed: int | None = None,
-    replica: int = 0,
-    confidence: float = 0.95,
+    scenario: Scenario, seed: int | None = None, replica: int = 0, confidence: float = 0.95
 ) -> NoiseFit:
     """Fit the noise of plant and sensors to the readings of a ``replica`` by the largest
     ``log_likelihood``: the variance of each column of B (in slots of each entry of a diagonal Q,

@@ -83,17 +83,7 @@ def find_smallest_set(
     search = _Search(replayer, limit)
     first, base = replayer.count, search.trace(())  # replays before; trace of the run as it was
     if base <= limit:
-        return SmallestSet(
-            messages=(),
-            trace=base,
-            limit=limit,
-            most=most,
-            complete=most,
-            candidates=len(candidates),
-            considered=0,
-            since=math.nan,
-            replays=0,
-        )
+        return SmallestSet((), base, limit, most, most, len(candidates), 0, math.nan, replays=0)
     recent = search.drop_oldest(sorted(candidates, key=lambda c: (c.sent, c.key)))
     # ``complete``: the size up to which all sets were tried without success.
     complete, messages = 0, None
@@ -140,16 +130,12 @@ class _Search:
         """Return ``candidates`` without the oldest, which change the trace by a NEGLIGIBLE part."""
         base = self.trace(())
         tolerance = NEGLIGIBLE * (base - self._limit)
-
-        def are_negligible(count: int) -> bool:
-            keys = [candidate.key for candidate in candidates[:count]]
-            return abs(self.trace(keys) - base) <= tolerance
-
         low, high = 0, len(candidates)
         # To the message if they are few: with a long run's, the replays serve better in the search.
         while high - low > len(candidates) // COARSENESS:
             middle = (low + high + 1) // 2
-            if are_negligible(middle):
+            oldest = [candidate.key for candidate in candidates[:middle]]
+            if abs(self.trace(oldest) - base) <= tolerance:
                 low = middle
             else:
                 high = middle - 1

@@ -6,7 +6,7 @@ import bisect
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -29,10 +29,8 @@ from netkf.trace.nees import traces
 from netkf.trace.schema import KINDS
 
 MAX_ERRORS = 24
-"""Largest number of errors of all nodes whose exact covariance costs about as much as a few runs.
-"""
-
-
+"""Largest number of errors of all nodes whose exact covariance costs about a few runs."""
+Batches = TypeVar("Batches", bound=tuple[Any, ...])
 NO_QUANTITIES = np.empty((0, 0))
 
 
@@ -68,12 +66,14 @@ def block_metrics(scenario: Scenario, seed: int, replicas: range, engine: Engine
         square, trace, _ = np.moveaxis(values.averages[:, :-1], 2, 0)
         ends = values.diverged[:, None], values.rounding_from[:, None]
         parts.append(RunMetrics(square, trace, values.messages, *ends, values.quantities[:, -1]))
-    return join_metrics(*parts)
+    return join_batches(*parts)
 
 
-def join_metrics(*parts: RunMetrics) -> RunMetrics:
-    """Return the metrics of several batches as one."""
-    return RunMetrics(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+def join_batches(*parts: Batches) -> Batches:
+    """Return the results of several batches, named tuples of arrays of one kind, as one."""
+    kind: Any = type(parts[0])
+    joined: Batches = kind(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+    return joined
 
 
 def expected_metrics(scenario: Scenario, seed: int, replica: int, engine: Engine) -> RunMetrics:

@@ -106,14 +106,7 @@ def _read_sweep(folder: Path, scenario: Scenario, manifest: dict[str, Any]) -> S
     path = folder / "sweep.parquet"
     table = _read_table(path, keys) if path.exists() else pd.DataFrame(columns=[*keys, *RESULTS])
     require_form(manifest["status"], TEXT, "status")
-    return StoredSweep(
-        directory=folder,
-        scenario=scenario,
-        keys=keys,
-        table=table,
-        status=manifest["status"],
-        manifest=manifest,
-    )
+    return StoredSweep(folder, scenario, keys, table, manifest["status"], manifest)
 
 
 def _read_table(path: Path, keys: tuple[str, ...]) -> pd.DataFrame:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 from netkf.core.printable import shorten
@@ -20,7 +21,7 @@ from netkf.figures.style import (
     write_figure,
 )
 from netkf.scenario.scenario import Scenario
-from netkf.studies.compare_filters import ComparedFilter, CompletedComparison
+from netkf.studies.compare_filters import ComparedFilter, FilterComparison
 from netkf.studies.sweep import CompletedSweep
 
 MAX_LABEL = 34
@@ -42,9 +43,9 @@ def sweep_picture(scenario: Scenario, completed: CompletedSweep) -> bool:
     return True
 
 
-def filter_picture(scenario: Scenario, completed: CompletedComparison) -> None:
+def filter_picture(scenario: Scenario, comparison: FilterComparison, directory: Path) -> None:
     """Write ``filters.png`` (errors, consistency, traffic) and ``errors.png`` (over time)."""
-    rows = [row for row in completed.comparison.rows if row.ran]
+    rows = [row for row in comparison.rows if row.ran]
     with style_context():
         figure = new_figure(9.6, 1.7 + 0.34 * len(rows))
         panels = figure.subplots(1, len(PANELS) + 1, sharey=True)
@@ -57,7 +58,7 @@ def filter_picture(scenario: Scenario, completed: CompletedComparison) -> None:
         labels = [shorten(row.filter, MAX_LABEL) for row in rows]
         panels[0].set_yticks(range(len(rows)), labels, parse_math=False)
         panels[0].invert_yaxis()
-        runs = f"{completed.comparison.runs:,} runs on the same draws; bars: two standard errors."
+        runs = f"{comparison.runs:,} runs on the same draws; bars: two standard errors."
         finite = [row for row in rows if math.isfinite(row.rms_error.value)]
         title = "No filter has a finite error"
         if finite:
@@ -65,9 +66,9 @@ def filter_picture(scenario: Scenario, completed: CompletedComparison) -> None:
             error = f"{best.rms_error.value:.3g}"
             title = f"{shorten(best.filter, MAX_LABEL)} has the smallest RMS error, {error}"
         finish_figure(figure, title, [f"{scenario.name}: {runs}"])
-    write_figure(figure, completed.directory / "filters.png")
-    if completed.comparison.curves:
-        write_figure(plot(completed.comparison), completed.directory / "errors.png")
+    write_figure(figure, directory / "filters.png")
+    if comparison.curves:
+        write_figure(plot(comparison), directory / "errors.png")
 
 
 def _draw_quantity(axes: Any, rows: list[ComparedFilter], name: str, label: str) -> None:

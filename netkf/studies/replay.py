@@ -133,10 +133,8 @@ class Replayer:
 
 def delivering(scenario: Scenario, deliveries: Deliveries) -> Scenario:
     """Return the scenario whose channel delivers what ``deliveries`` names, else as drawn."""
-    network = scenario.network
-    channel_of_run = network.channel
-    hops = channel_of_run.channels
-    loss = DeliveringLoss(channel_of_run.loss, deliveries, channels=hops)
+    network, channel_of_run = scenario.network, scenario.network.channel
+    loss = DeliveringLoss(channel_of_run.loss, deliveries, channels=channel_of_run.channels)
     delay = channel_of_run.delay
     # Without delays no message is late, and the engines have a faster path.
     if not isinstance(delay, NoDelay):

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from netkf.core.errors import ScenarioError
 from netkf.core.notebook import NotebookTable
@@ -16,7 +16,7 @@ from netkf.ensembles.replicas import replicate_blocks
 from netkf.runs.quantities import ensemble_names
 from netkf.scenario.scenario import Scenario
 from netkf.studies.help import BEYOND, describe_help
-from netkf.studies.metrics import METRICS, central_traces, join_metrics
+from netkf.studies.metrics import METRICS, central_traces, join_batches
 from netkf.studies.targets import (
     MISSED,
     NOT_SHOWN,
@@ -177,7 +177,9 @@ class Search:
             between = self._probe(low if middle is None else middle)
             if between.target == REACHED:
                 value, misses = self._bisect(between.value, bad.value)
-        central = self._describe_central(misses if value is None else value)
+        at = misses if value is None else value
+        described = "" if at is None else describe_help(self.at(at), self.target, self.key)
+        central = described and f"at {self.key} = {at:g} {described}"
         hopeless = value is None and central.endswith(BEYOND) and not self.key.startswith("sensors")
         return Sizing(
             self.key,
@@ -194,10 +196,6 @@ class Search:
             central=central,
         )
 
-    def _describe_central(self, value: float | None) -> str:
-        described = "" if value is None else describe_help(self.at(value), self.target, self.key)
-        return described and f"at {self.key} = {value:g} {described}"
-
     def _bisect(self, value: float, misses: float) -> tuple[float, float]:
         while len(self.probes) < MAX_PROBES[self.by]:
             middle = self._value_between(*sorted((value, misses)))
@@ -207,11 +205,8 @@ class Search:
             value, misses = (middle, misses) if reached else (value, middle)
             # Close to an undecided value simulation noise hides the limit.
             undecided = any(p.value == misses and p.target == UNDECIDED for p in self.probes)
-            if (
-                undecided
-                and value * misses > 0.0
-                and (max(abs(value), abs(misses)) <= END_RATIO * min(abs(value), abs(misses)))
-            ):
+            near, far = sorted((abs(value), abs(misses)))
+            if undecided and value * misses > 0.0 and far <= END_RATIO * near:
                 break
         return value, misses
 
@@ -254,27 +249,12 @@ class Search:
         say(f"{self.key} = {value:g}: simulating")
         while True:
             batch = min(max(plan.first, simulated), plan.runs - simulated)
-            metrics.append(
-                replicate_blocks(
-                    plan.task,
-                    join_metrics,
-                    scenario,
-                    batch,
-                    first=simulated,
-                    pool=plan.pool,
-                    form=METRICS,
-                )
-            )
+            where: dict[str, Any] = {"first": simulated, "pool": plan.pool, "form": METRICS}
+            metrics.append(replicate_blocks(plan.task, join_batches, scenario, batch, **where))
             simulated += batch
-            joined = join_metrics(*metrics)
-            interval = quantity_by_simulation(
-                joined,
-                target,
-                plan.level,
-                central,
-                ensemble_names(scenario),
-                target.has_rare_runs(scenario),
-            )
+            joined, names = join_batches(*metrics), ensemble_names(scenario)
+            rare = target.has_rare_runs(scenario)
+            interval = quantity_by_simulation(joined, target, plan.level, central, names, rare)
             state = target.decide(interval)
             say(
                 f"{self.key} = {value:g}: {target.quantity} {interval.value:.4g}, between "

@@ -19,7 +19,7 @@ from netkf.studies.metrics import (
     expected_errors_known,
     expected_metrics,
     is_small,
-    join_metrics,
+    join_batches,
 )
 from netkf.studies.parameter_grid import is_integer_key
 from netkf.studies.search import (
@@ -99,7 +99,7 @@ def size(
     # Expected squared errors vary less from run to run than squared errors: fewer runs suffice.
     if parsed.of_errors and not cheap and expected_errors_known(search.at(low)):
         expected = partial(expected_metrics, engine=engine_used)
-        task, first = partial(each_replica, expected, join_metrics), FIRST_EXPECTED
+        task, first = partial(each_replica, expected, join_batches), FIRST_EXPECTED
         quantity += ", each with its exact expected squared error given its events"
     if chosen == "both":
         bound = quantity_by_theory(search.at(low), parsed)[1]

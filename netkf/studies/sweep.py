@@ -36,7 +36,7 @@ from netkf.studies.metrics import (
     block_metrics,
     bound_traces,
     central_traces,
-    join_metrics,
+    join_batches,
     mean_over_runs,
     square_root_of,
     worst_node,
@@ -128,7 +128,7 @@ def _simulate_points(
         with explain_failures(point.scenario):
             task = partial(block_metrics, engine=choose_engine(plan.engine, point.scenario))
             metrics: RunMetrics = replicate_blocks(
-                task, join_metrics, point.scenario, plan.runs, pool=pool, form=METRICS
+                task, join_batches, point.scenario, plan.runs, pool=pool, form=METRICS
             )
             return metrics
 

@@ -55,26 +55,17 @@ def format_sizing(sizing: Sizing) -> str:
     rows = [
         [
             f"{p.value:g}",
-            format_number(p.quantity),
-            format_number(p.low),
-            format_number(p.high),
-            str(p.runs),
-            p.target,
-            p.by,
+            *map(format_number, (p.quantity, p.low, p.high)),
+            *(str(p.runs), p.target, p.by),
         ]
         for p in sorted(sizing.probes)
     ]
     if sizing.by == "theory":  # no runs, no intervals
         header = [header[0], f"{sizing.target.quantity} ({sizing.probes[0].by})", header[-2]]
         rows = [[f"{p.value:g}", f"{p.quantity:.7g}", p.target] for p in sorted(sizing.probes)]
-    lines = [format_table(header, rows), ""]
-    lines += [
-        format_answer(sizing),
-        f"{sizing.target.quantity}: {sizing.quantity}",
-        f"sure: {sizing.sure}",
-    ]
-    lines += [line for line in (sizing.central, sizing.advice) if line]
-    return "\n".join(lines)
+    lines = [format_table(header, rows), "", format_answer(sizing)]
+    lines += [f"{sizing.target.quantity}: {sizing.quantity}", f"sure: {sizing.sure}"]
+    return "\n".join([*lines, *filter(None, (sizing.central, sizing.advice))])
 
 
 def format_answer(sizing: Sizing) -> str:

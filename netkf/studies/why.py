@@ -71,14 +71,17 @@ def why(
     Raises ScenarioError for a node, time or run that does not exist, and for a run without events.
     """
     run, run_scenario = _check_run(run, scenario, replica, trust)
-    node = _find_node(run_scenario, node)
+    found = run_scenario.topology.find(str(node))
+    if found is None:
+        remedy = f"nodes: {list_some(run_scenario.nodes, 8)}"
+        raise ScenarioError("node", "must be a node of the scenario", node, remedy)
     at = _check_instant(run, run_scenario, at)
     # Keyword names are those of the command line: --most, --below, --replays.
     most = integer(low=1, high=MAX_MISSING)("most", most)
     limit = None if below is None else number(above=0.0)("below", below)
-    replayer = Replayer(run_scenario, run.seed, run.replica, node, at)
+    replayer = Replayer(run_scenario, run.seed, run.replica, found, at)
     outcome = _check_replay(run, replayer)
-    evidence = _Evidence(replayer, node, most)
+    evidence = _Evidence(replayer, found, most)
     sources = evidence.sources()
     smallest = None
     if math.isfinite(outcome.trace):
@@ -88,9 +91,10 @@ def why(
         count = integer(low=1)("replays", wanted)
         smallest = find_smallest_set(replayer, evidence.candidates(), target, most, count)
     what_ifs, left_out = _make_what_ifs(replayer, sources, smallest)
+    down = downtimes(run_scenario, run.seed, run.replica)
     return Why(
         scenario=run_scenario.name,
-        node=node,
+        node=found,
         at=at,
         seed=run.seed,
         replica=run.replica,
@@ -98,11 +102,7 @@ def why(
         what_ifs=what_ifs,
         smallest=smallest,
         missing=evidence.missing,
-        down=tuple(
-            one
-            for one in downtimes(run_scenario, run.seed, run.replica)
-            if one.begin <= at < one.end
-        ),
+        down=tuple(one for one in down if one.begin <= at < one.end),
         notes=_replay_notes(evidence, left_out),
         unit=run_scenario.common_unit,
     )
@@ -134,14 +134,6 @@ def _check_run(
         rule = "has no events, and they tell which messages came"
         raise ScenarioError(name, rule, None, "run it again with --trace full")
     return run, run_scenario
-
-
-def _find_node(scenario: Scenario, node: int | str) -> int:
-    found = scenario.topology.find(str(node))
-    if found is None:
-        remedy = f"nodes: {list_some(scenario.nodes, 8)}"
-        raise ScenarioError("node", "must be a node of the scenario", node, remedy)
-    return found
 
 
 def _check_replay(run: Run, replayer: Replayer) -> Outcome:

@@ -632,7 +632,7 @@ def test_a_comparison_of_filters_has_a_page(tmp_path):
     scenario = netkf.load(SCENARIOS / "push_sum_planar.toml", {"horizon": 2.0})
     filters = ["push-sum", {"kind": "hcmci", "steps": 2}, "local", "hybrid"]
     found = compare_filters(scenario, filters, 8, workers=1)
-    folder = write_comparison(scenario, found, tmp_path / "filters").directory
+    folder = write_comparison(scenario, found, tmp_path / "filters")
     text = make_page([folder])
     page, ran = Page(text), [row for row in found.rows if row.ran]
     best = min(ran, key=lambda row: row.quantities["rms_error"].value)

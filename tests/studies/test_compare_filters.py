@@ -124,7 +124,7 @@ def test_curves_are_mean_square_errors_over_the_runs(scenario, found, tmp_path):
     np.testing.assert_allclose(curve.square, np.mean(squares, axis=0), rtol=1e-12)
     np.testing.assert_allclose(curve.se, scipy.stats.sem(squares), rtol=1e-9, atol=1e-15)
     # The figure has them, also when it is read back.
-    directory = write_comparison(scenario, found, tmp_path / "out").directory
+    directory = write_comparison(scenario, found, tmp_path / "out")
     for comparison in (found, netkf.open(directory)):
         axes = comparison.plot("error").axes[0]
         lines = {line.get_label(): line.get_ydata() for line in axes.lines}

@@ -129,7 +129,7 @@ def compare(tmp_path_factory):
         filters = ["push-sum", {"kind": "hcmci", "steps": 2}, "central", "hybrid"]
         comparison = compare_filters(slots, filters, runs, workers=1)
         folder = tmp_path_factory.mktemp("compared") / "filters"
-        return comparison, write_comparison(slots, comparison, folder).directory
+        return comparison, write_comparison(slots, comparison, folder)
 
     return compare
 
