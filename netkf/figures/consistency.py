@@ -54,8 +54,7 @@ def nees_figure(data: FigureData) -> Picture:
     mean = float((values / unit)[known].mean())
     headline += f"{'is' if len(set(sizes)) == 1 else 'over n is'} {mean:.3g} where exact "
     headline += f"covariances give {n}"
-    finish_figure(figure, data.title(headline), data.caption(note, notes="nees"))
-    return figure
+    return finish_figure(figure, data.title(headline), data.caption(note, notes="nees"))
 
 
 def require_innovations(data: FigureData) -> Innovations:
@@ -82,8 +81,7 @@ def nis_figure(data: FigureData) -> Picture:
     headline += f"{share:.0%} of {count:,} readings lie in their {CONFIDENCE:.0%} interval"
     note = "Dots: single readings; line: means of bins, with the interval of each if P is exact."
     note += f" Readings: {read}." if (read := data.scenario.what_is_read(-1)) else ""
-    finish_figure(figure, data.title(headline), data.caption(note))
-    return figure
+    return finish_figure(figure, data.title(headline), data.caption(note))
 
 
 def draw_nis(axes: Any, innovations: Innovations) -> tuple[float, float]:
@@ -103,15 +101,8 @@ def draw_nis(axes: Any, innovations: Innovations) -> tuple[float, float]:
     has_readings = freedom > 0.0
     centres = 0.5 * (edges[1:] + edges[:-1])[has_readings]
     low, high = chi_square_interval(freedom[has_readings], CONFIDENCE)
-    axes.fill_between(
-        centres,
-        low,
-        high,
-        color=EXACT,
-        alpha=0.25,
-        lw=0,
-        label=f"{CONFIDENCE:.0%} of means if P is exact",
-    )
+    label = f"{CONFIDENCE:.0%} of means if P is exact"
+    axes.fill_between(centres, low, high, color=EXACT, alpha=0.25, lw=0, label=label)
     means = sums[has_readings] / freedom[has_readings]
     axes.plot(centres, means, color=INK, lw=1.6, label="mean of each bin")
     axes.axhline(1.0, color=EXACT, ls="-.", lw=1.1, label="expected")
@@ -153,8 +144,7 @@ def whiteness_figure(data: FigureData) -> Picture:
     )
     headline = f"{share:.0%} of autocorrelations are outside their 95% band, {judgement}"
     note = f"Band: 1.96 / root of {smallest:,}, the fewest readings of a node. Lags count readings."
-    finish_figure(figure, data.title(headline), data.caption(note))
-    return figure
+    return finish_figure(figure, data.title(headline), data.caption(note))
 
 
 def _draw_correlations(
@@ -166,15 +156,9 @@ def _draw_correlations(
     axes.axhline(0.0, color=EXACT, lw=0.8)
     all_curves = np.array(list(curves.values()))
     if len(curves) > 1:
-        axes.fill_between(
-            positions,
-            all_curves.min(axis=0),
-            all_curves.max(axis=0),
-            color=SKY,
-            alpha=0.35,
-            lw=0,
-            label="range of all nodes",
-        )
+        style: dict[str, Any] = {"color": SKY, "alpha": 0.35, "lw": 0}
+        low, high = all_curves.min(axis=0), all_curves.max(axis=0)
+        axes.fill_between(positions, low, high, **style, label="range of all nodes")
         mean = all_curves.mean(axis=0)
         axes.plot(positions, mean, "-o", color=INK, ms=3.5, label="mean of all nodes")
     node, name = worst

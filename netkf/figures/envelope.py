@@ -51,5 +51,4 @@ def envelope_figure(table: Any) -> Picture:
         f"{runs:,} runs of each law, with parameters drawn from their posterior; all ranges of a "
     )
     note += "law hold together."
-    finish_figure(figure, headline, [note])
-    return figure
+    return finish_figure(figure, headline, [note])

@@ -58,8 +58,9 @@ def error_figure(data: FigureData) -> Picture:
         except UnavailableError as error:
             draw_message(lower, str(error))
             sentences = ["There is no ground truth."]
-    finish_figure(figure, data.title(bound_headline(data)), data.caption(*sentences, notes="bound"))
-    return figure
+    return finish_figure(
+        figure, data.title(bound_headline(data)), data.caption(*sentences, notes="bound")
+    )
 
 
 def bound_headline(data: FigureData) -> str:
@@ -135,8 +136,7 @@ def quantiles_figure(data: FigureData) -> Picture:
     draw_legend(axes)
     values_of = "means over the runs" if data.runs > 1 else "this run"
     caption = data.caption(f"Quantiles over the nodes of {values_of}, at each sample.")
-    finish_figure(figure, data.title(headline), caption)
-    return figure
+    return finish_figure(figure, data.title(headline), caption)
 
 
 def _mark_worst(
@@ -200,24 +200,15 @@ def ratios_figure(data: FigureData) -> Picture:
     axes.set(xlabel=label, ylabel="node")
     draw_legend(axes)
     bars = "Bars: 95% intervals. " if data.runs > 1 else "One run has no intervals. "
-    selection = (
-        f"The {MAX_ROWS // 2} smallest and largest ratios."
-        if len(data.node_averages) > MAX_ROWS
-        else ""
-    )
-    headline = bound_headline(data) if key == "ratio" else _nees_headline(rows, key)
-    finish_figure(
-        figure,
-        data.title(headline),
-        data.caption(bars, selection, notes="bound" if key == "ratio" else "nees"),
-    )
-    return figure
-
-
-def _nees_headline(rows: list[dict[str, Any]], key: str) -> str:
+    is_all = len(data.node_averages) <= MAX_ROWS
+    selection = "" if is_all else f"The {MAX_ROWS // 2} smallest and largest ratios."
+    if key == "ratio":
+        caption = data.caption(bars, selection, notes="bound")
+        return finish_figure(figure, data.title(bound_headline(data)), caption)
     ratios = [row[key] for row in rows]
     span = f"{min(ratios):.3g} to {max(ratios):.3g}" if len(ratios) > 1 else f"{ratios[0]:.3g}"
-    return f"Squared errors are {span} times what P says; no bound applies"
+    headline = f"Squared errors are {span} times what P says; no bound applies"
+    return finish_figure(figure, data.title(headline), data.caption(bars, selection, notes="nees"))
 
 
 def _draw_ratios(axes: Any, data: FigureData, rows: list[dict[str, Any]], key: str) -> None:

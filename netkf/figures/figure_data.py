@@ -235,14 +235,8 @@ def _reduce_run(run: Run) -> FigureData:
 def reduce_completed_run(scenario: Scenario, completed: CompletedRun) -> FigureData:
     """Return the data to draw of a run that was just written, for its run.png."""
     status = "diverged" if completed.samples.diverged else completed.status
-    return collect_figure_data(
-        scenario,
-        completed.samples,
-        completed.promised,
-        completed.summary,
-        seed=scenario.seed,
-        status=status,
-    )
+    parts = completed.samples, completed.promised, completed.summary
+    return collect_figure_data(scenario, *parts, seed=scenario.seed, status=status)
 
 
 def collect_figure_data(

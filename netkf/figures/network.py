@@ -51,8 +51,9 @@ def network_figure(data: FigureData) -> Picture:
     for axes, (label, values) in zip(panels, quantities.items(), strict=True):
         draw_network(axes, data, values, label, positions)
     panels[0].legend(loc="upper left", bbox_to_anchor=(0.0, 0.0), ncols=2)
-    finish_figure(figure, data.title(_make_headline(data)), data.caption(*explain_network(data)))
-    return figure
+    return finish_figure(
+        figure, data.title(_make_headline(data)), data.caption(*explain_network(data))
+    )
 
 
 def error_label(data: FigureData) -> tuple[str, str]:

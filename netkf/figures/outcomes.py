@@ -51,8 +51,7 @@ def matrix_figure(data: FigureData) -> Picture:
     axes, figure = _draw_matrix(data.nodes, shares, (0.0, 1.0), SEQUENTIAL, "share delivered")
     axes.set(xlabel="receiver", ylabel="sender")
     note = "Rows are senders, columns receivers; white: nothing was sent."
-    finish_figure(figure, data.title(headline), data.caption(note))
-    return figure
+    return finish_figure(figure, data.title(headline), data.caption(note))
 
 
 def fate_figure(data: FigureData) -> Picture:
@@ -69,8 +68,7 @@ def fate_figure(data: FigureData) -> Picture:
         "Outcomes of one transmission at two of its hearers, about the mean of each link, all "
         "senders together; white: no common broadcast, or no loss."
     )
-    finish_figure(figure, data.title(headline), data.caption(note))
-    return figure
+    return finish_figure(figure, data.title(headline), data.caption(note))
 
 
 def _ticks(count: int) -> np.ndarray:
@@ -142,5 +140,4 @@ def losses_figure(data: FigureData) -> Picture:
     window = f"{edges[worst]:.6g} and {edges[worst + 1]:.6g} s"
     headline += f"; at worst {lost[worst] / sent[worst]:.0%}, between {window}"
     note = f"In parts of {edges[1]:.5g} s, by the time of sending; white: nothing was sent."
-    finish_figure(figure, data.title(headline), data.caption(note))
-    return figure
+    return finish_figure(figure, data.title(headline), data.caption(note))

@@ -62,7 +62,8 @@ def draw_nodes(axes: Any, data: FigureData, values: FloatArray, se: FloatArray |
         axes.add_collection(LineCollection(lines, colors=colour, **style))
         if se is not None:
             for k in indices:
-                low, high = root_interval(values[:, k], se[:, k])
+                squares = (values[:, k] ** 2 + s * NORMAL_QUANTILE * se[:, k] for s in (-1.0, 1.0))
+                low, high = (np.sqrt(np.maximum(square, 0.0)) for square in squares)
                 axes.fill_between(data.times, low, high, color=colour, alpha=0.2, lw=0)
         label = "nodes" if len(indices) > 1 else "the node"
         if has_both:
@@ -72,12 +73,6 @@ def draw_nodes(axes: Any, data: FigureData, values: FloatArray, se: FloatArray |
         count = len(data.nodes)
         axes.plot(np.repeat(data.times, count), values.ravel(), ".", color=INK, ms=4)
     axes.autoscale()
-
-
-def root_interval(root: FloatArray, se: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the 95% limits (T,) of ``root`` (T,), whose squares have errors ``se`` (T,)."""
-    low, high = (np.maximum(root**2 + s * NORMAL_QUANTILE * se, 0.0) for s in (-1.0, 1.0))
-    return np.sqrt(low), np.sqrt(high)
 
 
 def shade_downtimes(axes: Any, data: FigureData) -> None:

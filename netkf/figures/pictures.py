@@ -37,14 +37,12 @@ def overview(data: FigureData) -> Picture:
     without ground truth estimates, and no NEES.
     """
     figure = new_figure(11.0, 8.2)
+    drawings, heights = [draw_errors, draw_covariances], [1.0, 1.25]
     if data.shows_errors:
-        grid = figure.add_gridspec(2, 2)
-        cells = [grid[0, 0], grid[0, 1], grid[1, 0], grid[1, 1]]
-        drawings = [draw_errors, draw_covariances, draw_nees]
-    else:
-        grid = figure.add_gridspec(2, 2, height_ratios=[1.0, 1.25])
-        cells = [grid[0, 0], grid[0, 1], grid[1, :]]
-        drawings = [draw_errors, draw_covariances]
+        drawings, heights = [*drawings, draw_nees], [1.0, 1.0]
+    grid = figure.add_gridspec(2, 2, height_ratios=heights)
+    lower = [grid[1, 0], grid[1, 1]] if data.shows_errors else [grid[1, :]]
+    cells = [grid[0, 0], grid[0, 1], *lower]
     *panels, network = (figure.add_subplot(cell) for cell in cells)
     for axes, draw in zip(panels, drawings, strict=True):
         if len(data.times):
@@ -56,8 +54,9 @@ def overview(data: FigureData) -> Picture:
     network.legend(loc="lower left", bbox_to_anchor=(0.0, 1.04), ncols=2, borderaxespad=0.2)
     scenario = data.scenario
     title = f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name
-    finish_figure(figure, data.title(title), data.caption(*_caption_sentences(data), notes="both"))
-    return figure
+    return finish_figure(
+        figure, data.title(title), data.caption(*_caption_sentences(data), notes="both")
+    )
 
 
 def _caption_sentences(data: FigureData) -> list[str]:

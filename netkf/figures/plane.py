@@ -65,8 +65,9 @@ def plane_figure(data: FigureData) -> Picture:
     xlabel, ylabel = (_axis_label(data.scenario, d) for d in (0, 1))
     axes.set(xlabel=xlabel, ylabel=ylabel)
     axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
-    finish_figure(figure, data.title(_headline(data, paths)), data.caption(_coverage(data, paths)))
-    return figure
+    return finish_figure(
+        figure, data.title(_headline(data, paths)), data.caption(_coverage(data, paths))
+    )
 
 
 def _placed_blocks(scenario: Scenario) -> list[tuple[Block, list[int]]]:

@@ -69,8 +69,7 @@ def errors_figure(curves: Sequence[ErrorCurve], origin: str = "") -> Picture:
         missing = [shorten(c.label, MAX_LABEL) for c in curves if c not in known]
         if missing:
             sentences.append(f"Without errors: {list_some(missing, 6)}.")
-        finish_figure(figure, _headline(known), [" ".join(filter(None, sentences))])
-    return figure
+        return finish_figure(figure, _headline(known), [" ".join(filter(None, sentences))])
 
 
 def _draw_curve(axes: Any, curve: ErrorCurve, k: int) -> None:
@@ -135,11 +134,8 @@ def curves_of(
     """Return the curves of results by label, or by what tells them apart: filters, scenarios or
     numbers; and a sentence on the runs. Raises ScenarioError.
     """
-    if isinstance(results, Mapping):
-        labels, found = [str(label) for label in results], list(results.values())
-    else:
-        found = list(results)
-        labels = []
+    labels = [str(label) for label in results] if isinstance(results, Mapping) else []
+    found = list(results.values() if isinstance(results, Mapping) else results)
     if not found:
         raise ScenarioError("", "plot needs a run or an ensemble", results, "name at least one")
     data = [reduce_result(result) for result in found]

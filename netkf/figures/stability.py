@@ -91,8 +91,7 @@ def stability_figure(data: FigureData) -> Picture:
     caption = data.caption(
         "From theory alone: no simulation. Existence of the steady state of Tanwani's H(12)."
     )
-    finish_figure(figure, headline, caption)
-    return figure
+    return finish_figure(figure, headline, caption)
 
 
 def reason_to_omit_stability(data: FigureData) -> str | None:
@@ -147,8 +146,7 @@ def sweep_figure(scenario: Scenario, table: Any, keys: Sequence[str], status: st
     draw = _draw_sweep_curves if len(keys) == 1 else _draw_sweep_map
     draw(axes, table, list(keys), label_text(scenario.unit))
     prefix = "" if status == "complete" else "Interrupted: "
-    finish_figure(figure, prefix + _describe_best(table, keys), caption)
-    return figure
+    return finish_figure(figure, prefix + _describe_best(table, keys), caption)
 
 
 def _draw_sweep_curves(axes: Any, table: Any, keys: list[str], unit: str) -> None:
@@ -157,15 +155,9 @@ def _draw_sweep_curves(axes: Any, table: Any, keys: list[str], unit: str) -> Non
     columns = (("worst_rms", "node with the largest error"), ("mean_rms", "all nodes"))
     for (column, label), series in zip(columns, SERIES, strict=False):
         bars = NORMAL_QUANTILE * table[f"{column}_se"].fillna(0.0).to_numpy()[order]
-        style = {
-            "color": series.colour,
-            "ls": series.dashes,
-            "marker": series.marker,
-            "ms": 4,
-            "capsize": 2,
-        }
+        style = {"color": series.colour, "ls": series.dashes, "marker": series.marker}
         errors = table[column].to_numpy()[order]
-        axes.errorbar(positions[order], errors, yerr=bars, label=label, **style)
+        axes.errorbar(positions[order], errors, yerr=bars, label=label, ms=4, capsize=2, **style)
     bound = np.sqrt(table["bound"].to_numpy(dtype=np.float64))[order]
     if np.isfinite(bound).any():
         axes.plot(
@@ -292,8 +284,7 @@ def law_figure(data: FigureData) -> Picture:
     axes.set(xlabel=f"trace of P, squared {data.unit}", ylabel="share of samples above")
     draw_legend(axes)
     note = "The first fifth of the samples is left out. Samples of one run are not independent."
-    finish_figure(figure, data.title(headline), data.caption(note))
-    return figure
+    return finish_figure(figure, data.title(headline), data.caption(note))
 
 
 def _draw_tail(axes: Any, sample: FloatArray, colour: str, dashes: str, label: str) -> None:

@@ -1,8 +1,7 @@
 """The style of all figures: colours, line styles, titles, captions and legends; and their files.
 
 Colours are those of Okabe and Ito (Color Universal Design, 2008), which people with any common
-colour blindness can tell apart. Series also differ in lightness, dashes or markers, for prints in
-grey.
+colour blindness can tell apart.
 """
 
 from __future__ import annotations
@@ -31,8 +30,6 @@ BLUE, VERMILLION, GREEN, PURPLE, INK, ORANGE, SKY, MUTED = (one.colour for one i
 FAINT, YELLOW = "#bbbbbb", "#F0E442"
 SENSING, RELAY, EXACT, LOST = VERMILLION, SKY, GREEN, VERMILLION
 """Colours of nodes with and without a sensor, of exact values of theory, and of lost messages."""
-
-
 SEQUENTIAL = "cividis_r"
 """Colour map of quantities: its lightness decreases as the quantity grows, also without colour."""
 
@@ -64,8 +61,6 @@ POINTS_PER_INCH = 72.0
 SECONDS = "simulated seconds"
 TITLE_SIZE, CAPTION_SIZE, LEGEND_SIZE = 10.5, 7.5, 7.5
 """Font sizes in points."""
-
-
 _is_styled: list[bool] = []
 
 
@@ -105,13 +100,14 @@ def new_figure(width: float = 7.4, height: float = 4.4) -> Picture:
     return figure
 
 
-def finish_figure(figure: Figure, headline: str, caption: Sequence[str]) -> None:
-    """Put the headline above a figure and the caption below, in lines that fit its width."""
+def finish_figure(figure: Picture, headline: str, caption: Sequence[str]) -> Picture:
+    """Return a figure with the headline above and the caption below, in lines that fit."""
     width = 0.94 * float(figure.get_size_inches()[0]) * POINTS_PER_INCH
     title = break_lines(headline, width, TITLE_SIZE, "bold")
     figure.suptitle(title, x=0.01, ha="left", fontsize=TITLE_SIZE, color=INK, fontweight="bold")
     lines = [break_lines(sentence, width, CAPTION_SIZE) for sentence in caption if sentence]
     figure.supxlabel("\n".join(lines), x=0.01, ha="left", fontsize=CAPTION_SIZE, color=MUTED)
+    return figure
 
 
 def break_lines(text: str, width: float, size: float, weight: str = "normal") -> str:
@@ -120,18 +116,15 @@ def break_lines(text: str, width: float, size: float, weight: str = "normal") ->
     """
     words, pieces = one_line(text).split(), list[str]()
     while words:
-        count = _count_fitting(words, width, size, weight)
+        # As many words as one line takes, at least one.
+        count = 1 + bisect.bisect_right(
+            range(2, len(words) + 1),
+            width,
+            key=lambda k: text_width(" ".join(words[:k]), size, weight),
+        )
         pieces += _split_word(" ".join(words[:count]), width, size, weight)
         words = words[count:]
     return "\n".join(pieces).replace("$", r"\$")
-
-
-def _count_fitting(words: list[str], width: float, size: float, weight: str) -> int:
-    """Return how many of the ``words`` one line takes, at least 1."""
-    more = range(2, len(words) + 1)
-    return 1 + bisect.bisect_right(
-        more, width, key=lambda count: text_width(" ".join(words[:count]), size, weight)
-    )
 
 
 def _split_word(line: str, width: float, size: float, weight: str) -> list[str]:
@@ -226,8 +219,7 @@ def message_figure(headline: str, message: str, caption: Sequence[str]) -> Pictu
     """Return a figure that shows only a message, with a ``headline`` and a ``caption``."""
     figure = new_figure(7.4, 2.2)
     draw_message(figure.add_subplot(), message)
-    finish_figure(figure, headline, caption)
-    return figure
+    return finish_figure(figure, headline, caption)
 
 
 def set_scale(axes: Any, values: FloatArray, levels: Sequence[float] = ()) -> None:

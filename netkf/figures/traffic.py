@@ -122,8 +122,7 @@ def age_figure(data: FigureData) -> Picture:
         "Age of information: time since the freshest message that a node has heard was sent. "
         f"Left: means and maxima over {end / AGE_BINS:.3g} s."
     )
-    finish_figure(figure, data.title(headline), data.caption(note))
-    return figure
+    return finish_figure(figure, data.title(headline), data.caption(note))
 
 
 def _draw_ages(axes: Any, data: FigureData, edges: FloatArray, ages: list[AgeSawtooth]) -> None:
@@ -178,11 +177,6 @@ def _last_time(data: FigureData) -> float:
     return last if last > 0.0 else data.scenario.horizon
 
 
-def messages_by_direction(messages: np.ndarray) -> list[np.ndarray]:
-    """Return those of the MESSAGE rows (M,) with an outcome, by direction."""
-    return list(by_link(messages[messages["outcome"] != UNDER_WAY]))
-
-
 def links_figure(data: FigureData) -> Picture:
     """Draw delivered and lost messages of directions over time; raises UnavailableError."""
     directions = _require_messages(data)
@@ -221,13 +215,12 @@ def links_figure(data: FigureData) -> Picture:
     note = "All messages are shown."
     if omissions:
         note = f"Shown: {' of '.join(omissions)}; the title counts all."
-    finish_figure(figure, data.title(headline), data.caption(note))
-    return figure
+    return finish_figure(figure, data.title(headline), data.caption(note))
 
 
 def _require_messages(data: FigureData) -> list[np.ndarray]:
-    """Return the messages by direction; raises UnavailableError without any."""
-    directions = messages_by_direction(data.joined)
+    """Return the messages with an outcome by direction; raises UnavailableError without any."""
+    directions = list(by_link(data.joined[data.joined["outcome"] != UNDER_WAY]))
     if not directions:
         raise UnavailableError("No message was delivered or lost.")
     return directions
@@ -270,8 +263,7 @@ def delivery_figure(data: FigureData) -> Picture:
     note = "Intervals: Wilson, 95%."
     if misses is not None:
         note += f" {misses} of {len(directions)} intervals exclude the scenario's probability."
-    finish_figure(figure, data.title(headline), data.caption(note))
-    return figure
+    return finish_figure(figure, data.title(headline), data.caption(note))
 
 
 def _draw_shares(

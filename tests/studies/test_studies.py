@@ -27,7 +27,7 @@ from netkf.studies.metrics import (
     central_traces,
     expected_errors_known,
     expected_metrics,
-    join_metrics,
+    join_batches,
 )
 from netkf.studies.parameter_grid import parse_grid, parse_interval, table_column
 from netkf.studies.size import size
@@ -525,7 +525,7 @@ def test_exact_errors_given_the_events_have_the_mean_of_squared_ones(build):
     scenario = build(**changes)
     assert expected_errors_known(scenario)
     engine = choose_engine("auto", scenario)
-    exact = join_metrics(*(expected_metrics(scenario, 0, k, engine) for k in range(60)))
+    exact = join_batches(*(expected_metrics(scenario, 0, k, engine) for k in range(60)))
     plain = block_metrics(scenario, 0, range(60), engine)
     one, other = (all_nodes(found.mean_square) for found in (exact, plain))
     assert abs(one.value - other.value) < 4.0 * np.hypot(one.error, other.error)
