@@ -192,10 +192,7 @@ def _study_options(plan: Plan, given: argparse.Namespace) -> argparse.Namespace:
 
 
 def _missing_runs(
-    run: Run,
-    options: argparse.Namespace,
-    study: PlannedStudy,
-    pool_options: PoolOptions | None = None,
+    run: Run, options: argparse.Namespace, study: PlannedStudy, pool: PoolOptions | None = None
 ) -> list[Gap]:
     """Run a study silently; return the ensembles with missing runs, none if it came to its end."""
     from netkf.ensembles.replicas import MissingRunsError
@@ -205,12 +202,10 @@ def _missing_runs(
         if hasattr(options, "out"):
             options.out = Path(folder) / "out"
         # The notes of the study are printed once, by merge; a worker shows its progress.
-        quiet = contextlib.redirect_stderr(
-            io.StringIO() if study.worker.part is None else sys.stderr
-        )
+        notes = io.StringIO() if study.worker.part is None else sys.stderr
         try:
-            with quiet:
-                _run_on(run, options, study, pool_options)
+            with contextlib.redirect_stderr(notes):
+                _run_on(run, options, study, pool)
         except MissingRunsError as error:
             return error.gaps
         finally:
@@ -219,14 +214,11 @@ def _missing_runs(
 
 
 def _run_on(
-    run: Run,
-    options: argparse.Namespace,
-    study: PlannedStudy,
-    pool_options: PoolOptions | None = None,
+    run: Run, options: argparse.Namespace, study: PlannedStudy, given: PoolOptions | None = None
 ) -> int:
     from netkf.ensembles.pools import PoolOptions, make_pool
 
-    given = pool_options or PoolOptions(1)
+    given = given or PoolOptions(1)
     with make_pool(given.workers or 1, given) as pool:
         pool.plan = study
         options.executor, options.workers, options.scheduler = pool, None, None
@@ -240,10 +232,12 @@ def print_missing(plan: Plan, gaps: list[Gap], rounds: bool = False) -> None:
     short = [gap for gap in gaps if gap.missing]
     missing = sum(len(runs) for gap in short for runs in gap.missing)
     total = sum(gap.runs for gap in gaps)
-    where = [
-        (f"ensemble {gap.number}: " if len(gaps) > 1 else "") + _describe_ranges(gap.missing)
-        for gap in short[:SHOWN]
-    ]
+    where = []
+    for gap in short[:SHOWN]:
+        ranges = ", ".join(map(_describe_range, gap.missing[:SHOWN]))
+        further = len(gap.missing) - SHOWN
+        ranges += f" and {further} further ranges" if further > 0 else ""
+        where.append((f"ensemble {gap.number}: " if len(gaps) > 1 else "") + ranges)
     more = f"; and {len(short) - SHOWN} further ensembles" if len(short) > SHOWN else ""
     of = count_phrase(total, "run") + (f" of round {short[0].number}" if rounds else "")
     print(f"{missing:,} of {of} have no result: {'; '.join(where)}{more}")
@@ -266,11 +260,6 @@ def _missing_parts(gaps: list[Gap], tasks: int) -> set[int]:
             first, last = (bisect_right(starts[gap.runs], run) for run in (runs[0], runs[-1]))
             parts.update(range(first - 1, last))
     return parts
-
-
-def _describe_ranges(missing: list[range]) -> str:
-    more = f" and {len(missing) - SHOWN} further ranges" if len(missing) > SHOWN else ""
-    return ", ".join(map(_describe_range, missing[:SHOWN])) + more
 
 
 def _describe_range(numbers: range) -> str:

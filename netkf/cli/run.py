@@ -56,15 +56,8 @@ def _run_once(scenario: Scenario, options: argparse.Namespace) -> int:
             return 0
     draw = None if options.no_plot else partial(pictures.draw_picture, pictures.RUN, scenario)
     with ProgressLine() as line:
-        completed = run_to_directory(
-            scenario,
-            options.out,
-            options.engine,
-            options.trace or "full",
-            line.make_time_update(scenario.horizon),
-            draw,
-            replica,
-        )
+        how = options.engine, options.trace or "full", line.make_time_update(scenario.horizon)
+        completed = run_to_directory(scenario, options.out, *how, draw, replica)
     print_summary(scenario, completed)
     duration = f"{completed.seconds:.2f} s"
     if completed.events >= MIN_RATED_EVENTS:
@@ -84,9 +77,7 @@ def _run_ensemble(scenario: Scenario, options: argparse.Namespace) -> int:
     from netkf.ensembles.pools import PoolOptions
 
     pool = PoolOptions(workers=options.workers, scheduler=options.scheduler)
-    ensemble_options = EnsembleOptions(
-        options.engine, options.trace or "first", options.resume, pool
-    )
+    settings = EnsembleOptions(options.engine, options.trace or "first", options.resume, pool)
     draw = None
     if not options.no_plot:
         draw = partial(pictures.draw_picture, pictures.ENSEMBLE, scenario)
@@ -98,7 +89,7 @@ def _run_ensemble(scenario: Scenario, options: argparse.Namespace) -> int:
             scenario,
             options.runs,
             options.out,
-            ensemble_options,
+            settings,
             progress=line.make_count_update("runs"),
             finish=draw,
             note=_print_note,

@@ -51,20 +51,8 @@ BUDGET = Budget(messages=100_000, values=400_000)
 MAX_NODES = 2_000
 """Nodes up to which a page has live views."""
 SCRIPTS = (
-    "format.js",
-    "decode.js",
-    "state.js",
-    "theme.js",
-    "brush.js",
-    "network.js",
-    "estimates.js",
-    "sequence.js",
-    "why.js",
-    "tracks.js",
-    "curves.js",
-    "figures.js",
-    "clock.js",
-    "main.js",
+    *("format", "decode", "state", "theme", "brush", "network", "estimates", "sequence", "why"),
+    *("tracks", "curves", "figures", "clock", "main"),
 )
 POLICY = (
     "default-src 'none'; script-src {script}; style-src {style}; img-src data:; "
@@ -215,7 +203,13 @@ def _assemble_page(
         if entry.layout is not None
     ]
     runs = [first for first, *_ in choices]
-    rules = list(dict.fromkeys(rule for data in choices for run in data for rule in _rules(run)))
+    rules = [
+        f"{run['words']}{': ' * bool(run['words'])}{rule}"
+        for data in choices
+        for run in data
+        for rule in thinning_rules(run)
+    ]
+    rules = list(dict.fromkeys(rules))
     packed, sizes = packer.text()
     sources = [entry.source for entry in entries]
     data = {
@@ -256,10 +250,6 @@ def _live_data(entry: _AnalysedSource, limits: Budget, packer: Packer) -> dict[s
     assert entry.layout is not None
     run, layout = entry.source.run, entry.layout
     return run_data(entry.source, run, entry.messages, entry.readings, layout, limits, packer)
-
-
-def _rules(data: dict[str, Any]) -> list[str]:
-    return [f"{data['words']}{': ' * bool(data['words'])}{rule}" for rule in thinning_rules(data)]
 
 
 def _page_header(entries: list[_AnalysedSource], comparison: Comparison | str | None) -> str:
@@ -470,6 +460,6 @@ def _script() -> str:
     """Return uPlot and the page's own files in the scope of one function."""
     # The licence of uPlot requires its text in every copy.
     licence = "/*! uPlot\n" + _asset("uPlot.LICENSE.txt").replace("*/", "") + "*/\n"
-    scripts = "\n".join(_asset(name) for name in SCRIPTS)
+    scripts = "\n".join(_asset(f"{name}.js") for name in SCRIPTS)
     plots = _asset("language.js") + _asset("uPlot.iife.min.js")
     return f'{licence}{plots}\n(function () {{\n"use strict";\n{scripts}\n}})();\n'

@@ -229,7 +229,7 @@ def _format_cell(value: Any, error: Any) -> str:
 def versions_table(source: ReportSource) -> str:
     """Return a table of the versions, the seed and the status in the manifest of a source."""
     manifest = source.manifest
-    rows = [(name, value) for name, value in manifest.get("versions", {}).items()]
+    rows = [*manifest.get("versions", {}).items()]
     keys = ("seed", "replica", "engine", "status", "events", "fingerprint")
     rows += [(key, manifest[key]) for key in keys if key in manifest]
     return table_box("Versions and identity of the run", ("what", "value"), rows, "words")

@@ -206,13 +206,8 @@ def output_file(out: str | Path, name: str) -> Path:
 BLOCKS_FOLDER = "blocks"
 """Folder, in the directory of an unfinished ensemble, of its checkpoints by block of runs."""
 RUN_FILES = (
-    "scenario.toml",
-    "manifest.json",
-    "events.parquet",
-    "states.parquet",
-    "ensemble.parquet",
-    "summary.json",
-    "run.png",
+    *("scenario.toml", "manifest.json", "events.parquet", "states.parquet"),
+    *("ensemble.parquet", "summary.json", "run.png"),
 )
 """Names of the files that netkf writes to a run directory."""
 

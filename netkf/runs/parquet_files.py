@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -45,15 +46,9 @@ def read_numbers(
     """
     import pandas as pd
 
-    with _open_for_reading(path) as source, pq.ParquetFile(source) as file:
-        names, types = file.schema_arrow.names, file.schema_arrow.types
-        types_by_name = dict(zip(names, types, strict=True))
+    with _reading_columns(path, columns, run, _is_numeric, " of numbers") as table:
         for name in columns:
-            if names.count(name) != 1 or not _is_numeric(types_by_name[name]):
-                raise DamagedError(f"{path.name} has no column {name} of numbers")
-        table = _read_columns(file, source, path.name, columns, run)
-        for name in columns:
-            is_allowed = allow_empty and pa.types.is_floating(types_by_name[name])
+            is_allowed = allow_empty and pa.types.is_floating(table[name].type)
             if table[name].null_count and not is_allowed:
                 raise DamagedError(f"{path.name} has missing values")
         # Without pandas metadata, which may ask for other types than plain numbers.
@@ -64,11 +59,7 @@ def read_texts(path: Path, column: str, run: int | None = None) -> pd.Series[str
     """Return a text column, of one ``run`` or all, as a categorical series; raises DamagedError."""
     import pandas as pd
 
-    with _open_for_reading(path) as source, pq.ParquetFile(source) as file:
-        names = file.schema_arrow.names
-        if names.count(column) != 1:
-            raise DamagedError(f"{path.name} has no column {column}")
-        table = _read_columns(file, source, path.name, [column], run)
+    with _reading_columns(path, [column], run) as table:
         texts = table[column].cast(pa.string()).combine_chunks()
         if texts.null_count:
             raise DamagedError(f"{path.name} has missing values")
@@ -77,14 +68,10 @@ def read_texts(path: Path, column: str, run: int | None = None) -> pd.Series[str
 
 def read_flags(path: Path, column: str) -> np.ndarray:
     """Return a column of booleans (rows,); raises DamagedError, also for empty cells."""
-    with _open_for_reading(path) as source, pq.ParquetFile(source) as file:
-        types_by_name = dict(zip(file.schema_arrow.names, file.schema_arrow.types, strict=True))
-        if not pa.types.is_boolean(types_by_name.get(column, pa.null())):
-            raise DamagedError(f"{path.name} has no column {column} of truth values")
-        flags = _read_columns(file, source, path.name, [column], run=None)[column]
-        if flags.null_count:
+    with _reading_columns(path, [column], None, pa.types.is_boolean, " of truth values") as table:
+        if table[column].null_count:
             raise DamagedError(f"{path.name} has missing values")
-        return np.asarray(flags.to_numpy(), dtype=bool)
+        return np.asarray(table[column].to_numpy(), dtype=bool)
 
 
 @contextlib.contextmanager
@@ -99,15 +86,26 @@ def _open_arrow_file(path: Path, mode: str) -> Any:
     return pa.OSFile(os.fsencode(path), mode)
 
 
-def _read_columns(
-    file: Any, source: Any, name: str, columns: Sequence[str], run: int | None
-) -> Any:
-    if file.metadata.num_rows > MAX_READ_ROWS:
-        raise DamagedError(f"{name} has more than {MAX_READ_ROWS:,} rows")
-    if run is None:
-        return file.read(columns=list(columns))
-    # A filter skips row groups whose statistics exclude the run.
-    return pq.read_table(source, columns=list(columns), filters=[("run", "==", run)])
+@contextlib.contextmanager
+def _reading_columns(
+    path: Path,
+    columns: Sequence[str],
+    run: int | None,
+    fits: Callable[[Any], bool] = lambda _: True,
+    kind: str = "",
+) -> Iterator[Any]:
+    """Yield a table of ``columns`` whose types ``fits`` takes, of one ``run`` or of all."""
+    with _open_for_reading(path) as source, pq.ParquetFile(source) as file:
+        names = file.schema_arrow.names
+        for name in columns:
+            if names.count(name) != 1 or not fits(file.schema_arrow.field(name).type):
+                raise DamagedError(f"{path.name} has no column {name}{kind}")
+        if file.metadata.num_rows > MAX_READ_ROWS:
+            raise DamagedError(f"{path.name} has more than {MAX_READ_ROWS:,} rows")
+        # A filter skips row groups whose statistics exclude the run.
+        filters = {} if run is None else {"filters": [("run", "==", run)]}
+        read = file.read if run is None else partial(pq.read_table, source)
+        yield read(columns=list(columns), **filters)
 
 
 def column_names(path: Path) -> list[str]:

@@ -93,7 +93,10 @@ def traffic(scenario: Scenario, transmissions: Transmissions) -> FloatArray:
             scenario.message_size(node, phase) if count else 0.0
             for node, count in zip(scenario.nodes, counts, strict=True)
         ]
-        spent = {size: _joules(energy, size, radio.frames(size)) for size in set(sizes)}
+        spent = {
+            size: energy.joules_per_packet * radio.frames(size) + energy.joules_per_byte * size
+            for size in set(sizes)
+        }
         costs = [(1.0, size, spent[size]) for size in sizes]
         found[:-1, 3:] += np.array(counts)[:, None] * np.array(costs)
     found[-1, 3:] = found[:-1, 3:].sum(axis=0)
@@ -156,10 +159,6 @@ class NetworkSink(Sink):
         self.connectivity.finish()
         found[:, 2] = self.connectivity.shares()
         return found
-
-
-def _joules(energy: Energy, size: float, frames: int) -> float:
-    return energy.joules_per_packet * frames + energy.joules_per_byte * size
 
 
 def has_ages(scenario: Scenario) -> bool:

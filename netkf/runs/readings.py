@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from netkf.linalg.arrays import FloatArray
 from netkf.plants.readings import covariance_of
 from netkf.rng.streams import Streams
-from netkf.runs.outcomes import Downtime, downtimes
+from netkf.runs.outcomes import downtimes
 from netkf.runs.simulate import simulate
 from netkf.scenario.model import PlacedSensor
 from netkf.scenario.sampling import times_of_sensor
@@ -96,7 +96,10 @@ def collect_readings(
                 scenario, streams, (node, one), numbers[key], rows, states - origin
             )
             at = scenario.time_grid.snap(times + _sensing_delay(scenario))
-            readings += (r for r in of_sensor if not _is_down(down, node, float(at[r.number])))
+            pauses = [one for one in down if one.node == node]
+            readings += (
+                r for r in of_sensor if not any(p.begin <= at[r.number] < p.end for p in pauses)
+            )
     readings.sort(key=lambda one: one.number)
     return RunReadings(times, readings, run, origin)
 
@@ -107,11 +110,6 @@ def _sensing_delay(scenario: Scenario) -> float:
     before, found, _ = " ".join(timing.schedule or ()).partition("sense")
     delays = scenario.slotted and found and timing.talks
     return before.count("exchange") * scenario.phase_length if delays else 0.0
-
-
-def _is_down(downtimes: Sequence[Downtime], node: int, t: float) -> bool:
-    """Return True if a ``node`` (id) is down at ``t``, and does not sense."""
-    return any(one.node == node and one.begin <= t < one.end for one in downtimes)
 
 
 def _known_response(scenario: Scenario, times: FloatArray) -> FloatArray:
@@ -133,9 +131,8 @@ def _readings_of(
 ) -> Iterator[SensorReading]:
     """Yield readings of a ``sensor`` at ``instants`` (K,), with states in rows ``places`` (K,)."""
     node, one = sensor
-    path: Any = (scenario.slot_path if scenario.slotted else scenario.sample_path)(
-        streams, node, one
-    )
+    open_path: Any = scenario.slot_path if scenario.slotted else scenario.sample_path
+    path = open_path(streams, node, one)
     R = scenario.noise_covariance(one.entry, believed=True)
     for k, (instant, place) in enumerate(zip(instants, places.tolist(), strict=True)):
         if place == len(states):

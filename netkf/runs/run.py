@@ -95,9 +95,8 @@ def run_to_directory(
     """
     replica = integer(low=0)("replica", replica)
     chosen_engine = choose_engine(engine, scenario, announce=False)
-    output = _create_output(
-        scenario, out, scenario.seed, replica, chosen_engine.name, trace != "none"
-    )
+    name, tables = chosen_engine.name, trace != "none"
+    output = _create_output(scenario, out, scenario.seed, replica, name, tables)
     choose_engine(engine, scenario)  # says that it compiles, if nothing was refused
     recorder = Recorder(output.sinks)
     is_complete = False
@@ -111,16 +110,8 @@ def run_to_directory(
         output.close_tables()
         promised = promise_traces(scenario, np.array(output.samples.times))
         summary = output.write_summary(promised, recorder.count, recorder.sums, status)
-        completed = CompletedRun(
-            directory=output.directory,
-            status=status,
-            summary=summary,
-            samples=output.samples,
-            promised=promised,
-            events=recorder.total,
-            seconds=seconds,
-            engine=chosen_engine.name,
-        )
+        results = summary, output.samples, promised, recorder.total
+        completed = CompletedRun(output.directory, status, *results, seconds, name)
         if finish is not None:
             finish(completed)
     except BaseException as error:
@@ -258,20 +249,12 @@ def _keep_partial_results(
         with contextlib.suppress(Exception):  # a full disk fails again, and ``error`` says so
             finish()
     if not (output.directory / "summary.json").exists():
-        unknown = PromisedTraces(
-            bound=None,
-            limit=np.nan,
-            central=np.nan,
-            reason=f"not computed: the run {ENDINGS[status]}",
-        )
+        reason = f"not computed: the run {ENDINGS[status]}"
+        unknown = PromisedTraces(None, np.nan, np.nan, reason)
         with contextlib.suppress(OSError):
             output.write_summary(unknown, recorder.count, recorder.sums, status)
-    output.manifest.write(
-        status,
-        _event_totals(recorder.total, str(output.fingerprint), recorder.stats),
-        is_complete,
-        error,
-    )
+    totals = _event_totals(recorder.total, str(output.fingerprint), recorder.stats)
+    output.manifest.write(status, totals, is_complete, error)
 
 
 def _event_totals(events: int, fingerprint: str, stats: dict[str, int]) -> dict[str, Any]:

@@ -191,13 +191,11 @@ def summarise(
     if network is not None:
         rows = [a | b for a, b in zip(rows, quantity_rows(NETWORK, network), strict=True)]
     *nodes, overall = rows
-    counts = {
-        "sent": sink.transmissions.sent(scenario.nodes),
-        "transmissions": sink.transmissions.transmissions(scenario.nodes),
-    }
-    for row, *values in zip(nodes, *counts.values(), strict=True):
-        row |= dict(zip(counts, values, strict=True))
-    overall["transmissions"] = sum(counts["transmissions"])
+    sent = sink.transmissions.sent(scenario.nodes)
+    transmissions = sink.transmissions.transmissions(scenario.nodes)
+    for row, *counts in zip(nodes, sent, transmissions, strict=True):
+        row["sent"], row["transmissions"] = counts
+    overall["transmissions"] = sum(transmissions)
     return {
         "nodes": nodes,
         "overall": overall,

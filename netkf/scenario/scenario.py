@@ -93,13 +93,17 @@ class Scenario(DerivedScenario):
             *unheard_notes(self),
             *stamp_notes(self),
             *grid_notes(self),
-            *self._share_notes,
             *self._unused_notes,
         )
 
     @property
     def _unused_notes(self) -> tuple[str, ...]:
         notes = []
+        if self.network.channel.loss.fate_share != 0.0 and not self.has_broadcasts:
+            notes.append(
+                "network.channel.loss: no fate is shared, because each transmission has one "
+                'hearer; broadcasts are those of activation.at = "nodes", or of slots'
+            )
         for key, plant in dict(self.all_plants).items():
             late = [c.start for c in getattr(plant, "schedule", ()) if c.start >= self.horizon]
             if late:
@@ -115,12 +119,3 @@ class Scenario(DerivedScenario):
                 f"filter.linearise: {kept} changes nothing, because plant and sensors are linear"
             )
         return tuple(notes)
-
-    @property
-    def _share_notes(self) -> tuple[str, ...]:
-        if self.network.channel.loss.fate_share == 0.0 or self.has_broadcasts:
-            return ()
-        return (
-            "network.channel.loss: no fate is shared, because each transmission has one hearer; "
-            'broadcasts are those of activation.at = "nodes", or of slots',
-        )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,7 @@ from netkf.scenario.records import (
     sensed_slots,
 )
 
+Used = Callable[[Any], bool]
 Use = dict[str, Any]
 """The use of one table: ``path``, ``rows``, ``used``, ``merged``, ``unused``, and for losses and
 delays ``beyond`` and ``after``; see ``record_usage``.
@@ -60,9 +61,8 @@ def record_usage(scenario: DerivedScenario, sent: Mapping[Link, int] | None) -> 
     }
     if scenario.position_table is not None:
         uses["network.positions"] = _make_use(scenario.position_table.use(scenario.horizon))
-    activation_use = _find_activation_use(scenario)
-    if activation_use is not None:
-        uses["network.activation"] = _make_use(activation_use)
+    if activation := _activation_table(scenario):
+        uses["network.activation"] = _make_use(count_rows(*activation[1:]))
     channel = scenario.network.channel
     uses |= {key: _make_use(use) for key, (_, use) in _find_law_uses(scenario).items()}
     for key, component in (("loss", channel.loss), ("delay", channel.delay)):
@@ -102,18 +102,11 @@ def unused_notes(scenario: DerivedScenario, without_states: bool = False) -> tup
 
 def repeat_notes(scenario: DerivedScenario) -> tuple[str, ...]:
     """Return a line for each table with rows that repeat others and are merged with them."""
-    activation, channel = scenario.network.activation, scenario.network.channel
+    channel = scenario.network.channel
     # By key path: what rows repeat, the name of the file, and a key of each row.
     tables: dict[str, tuple[str, str, Sequence[Any]]] = {}
-    if isinstance(activation, RecordedClock):
-        what = f"{activation.at.removesuffix('s')} and time"
-        ticks = _instants(scenario, activation.row_keys)
-        tables["network.activation"] = what, activation.path.name, ticks
-    if isinstance(activation, Contacts):
-        what = f"{activation.at.removesuffix('s')} and interval"
-        tables["network.activation"] = what, activation.path.name, activation.row_keys
-    if isinstance(activation, RecordedSlots):
-        tables["network.activation"] = "slot and link", activation.path.name, activation.row_keys
+    if activation := _activation_table(scenario):
+        tables["network.activation"] = activation[:3]
     for key, component in (("loss", channel.loss), ("delay", channel.delay)):
         if isinstance(component, RecordedLoss | RecordedDelay):
             table = component.table
@@ -154,24 +147,23 @@ def _instants(
 
 
 def _make_use(use: RowUse) -> Use:
-    counts: Use = {
-        name: getattr(use, name) for name in ("path", "rows", "used", "merged", "unused")
-    }
-    return counts
+    return {**use._asdict(), "unused": use.unused}
 
 
-def _find_activation_use(scenario: DerivedScenario) -> RowUse | None:
+def _activation_table(scenario: DerivedScenario) -> tuple[str, str, Sequence[Any], Used] | None:
+    """Return what rows of recorded ticks repeat, their file, their keys, and which are used."""
     activation, talks = scenario.network.activation, scenario.filter.algorithm.timing.talks
+    end = scenario.horizon if talks else 0.0
     if isinstance(activation, RecordedClock):
-        end = scenario.horizon if talks else 0.0
-        keys = _instants(scenario, activation.row_keys)
-        return count_rows(activation.path.name, keys, lambda key: key[2] and key[1] < end)
+        what, keys = f"{activation.at.removesuffix('s')} and time", activation.row_keys
+        ticks = _instants(scenario, keys)
+        return what, activation.path.name, ticks, lambda key: key[2] and key[1] < end
     if isinstance(activation, Contacts):
-        end, path = scenario.horizon if talks else 0.0, activation.path.name
-        return count_rows(path, activation.row_keys, lambda key: key[1] < end and key[2] > 0.0)
+        what, rows = f"{activation.at.removesuffix('s')} and interval", activation.row_keys
+        return what, activation.path.name, rows, lambda key: key[1] < end and key[2] > 0.0
     if isinstance(activation, RecordedSlots):
-        slots = exchange_slots(scenario) if talks else range(0)
-        return count_rows(activation.path.name, activation.row_keys, lambda key: key[0] in slots)
+        slots, path = exchange_slots(scenario) if talks else range(0), activation.path.name
+        return "slot and link", path, activation.row_keys, lambda key: key[0] in slots
     return None
 
 
