@@ -6,6 +6,7 @@ import argparse
 import os
 import re
 from contextlib import nullcontext
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
@@ -20,11 +21,15 @@ ONE_THREAD = ("check", "work", "merge")
 """Commands whose last digits must not depend on whether a run is simulated here or in a worker
 process, whose LAPACK has one thread.
 """
-SHORT = "compare", "consistency", "import", "innovations", "new", "report", "schema", "theory"
-"""Commands of one module, ``short``, which has ``run_NAME``."""
+SHARED = {
+    **dict.fromkeys(("compare", "consistency", "import", "innovations", "new"), "short"),
+    **dict.fromkeys(("report", "schema", "theory"), "short"),
+    **dict.fromkeys(("plan", "work", "merge"), "planned"),
+}
+"""Modules of several commands, which have ``run_NAME``."""
 BESIDE = (("tasks", "plan"), ("slurm", "plan"), ("time", "slurm"), ("most", "until"))
 """Options that mean nothing without another one, of commands that have both."""
-WORKERS_PER_CORE = 8  # more processes only fill the memory
+MAX_WORKERS = max(64, 8 * (os.cpu_count() or 1))  # more processes only fill the memory
 
 
 class Option(NamedTuple):
@@ -38,8 +43,8 @@ class Command(NamedTuple):
     """A command: its name, its help, and its options; those in a tuple exclude each other.
 
     The module of this package with its name has ``_run``, which runs it with the parsed options and
-    returns the exit status; of those in SHORT it is in ``short``. Unless it ``takes_scenario``,
-    there are no scenario file, ``--set`` and ``--trust``.
+    returns the exit status, or that of SHARED has ``run_NAME``. Unless it ``takes_scenario``, there
+    are no scenario file, ``--set`` and ``--trust``.
     """
 
     name: str
@@ -76,8 +81,8 @@ class Command(NamedTuple):
     def _run(self, options: argparse.Namespace) -> int:
         # Only now, so that ``netkf --help`` and usage errors do not wait for numpy and numba.
         name = self.name.replace("-", "_")
-        module: Any = import_module(f"netkf.cli.{'short' if name in SHORT else name}")
-        run = getattr(module, f"run_{name}" if name in SHORT else "_run")
+        module: Any = import_module(f"netkf.cli.{SHARED.get(name, name)}")
+        run = getattr(module, f"run_{name}" if name in SHARED else "_run")
         if getattr(options, "plan", None) is not None:
             from netkf.cli.planned import plan_study
 
@@ -96,10 +101,6 @@ def _option(name: str, text: str, **settings: Any) -> Option:
     return Option(name, {"help": text, **settings})
 
 
-def _flag(name: str, text: str) -> Option:
-    return _option(name, text, action="store_true")
-
-
 def _refuse(rule: str, text: str) -> NoReturn:
     raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
 
@@ -111,28 +112,16 @@ def _integer(text: str, least: int, largest: int) -> int:
     return int(text)
 
 
-def parse_count(text: str) -> int:
-    """Return a number of runs or replays; raises ArgumentTypeError unless it is 1 .. MAX_RUNS."""
-    return _integer(text, 1, MAX_RUNS)
-
-
-def parse_workers(text: str) -> int:
-    """Return the value of ``--workers``; raises ArgumentTypeError."""
-    return _integer(text, 1, max(64, WORKERS_PER_CORE * (os.cpu_count() or 1)))
-
-
-def parse_seed(text: str) -> int:
-    """Return the value of ``--seed``; raises ArgumentTypeError for any text but digits."""
-    if not text.isdecimal() or len(text) > 30:
-        _refuse("must be a non-negative integer of at most 30 digits", text)
+def _digits(text: str, most: int, rule: str) -> int:
+    if not text.isdecimal() or len(text) > most:
+        _refuse(rule, text)
     return int(text)
 
 
-def parse_replica(text: str) -> int:
-    """Return the value of ``--replica``; raises ArgumentTypeError."""
-    if not text.isdecimal() or len(text) > 12:
-        _refuse("must be an integer of at least 0", text)
-    return int(text)
+parse_count = partial(_integer, least=1, largest=MAX_RUNS)
+parse_workers = partial(_integer, least=1, largest=MAX_WORKERS)
+parse_seed = partial(_digits, most=30, rule="must be a non-negative integer of at most 30 digits")
+parse_replica = partial(_digits, most=12, rule="must be an integer of at least 0")
 
 
 def parse_replica_or_rank(text: str) -> int | str:
@@ -208,28 +197,16 @@ def _trust(folder: str) -> Option:
     return _flag("--trust", text)
 
 
-def _directories(text: str) -> Option:
-    return _option("directories", text, type=Path, nargs="+", metavar="DIR")
-
-
-def _runs(text: str, default: int | None) -> Option:
-    return _option("--runs", text, type=parse_count, default=default)
+_flag = partial(_option, action="store_true")
+_directories = partial(_option, "directories", type=Path, nargs="+", metavar="DIR")
+_runs = partial(_option, "--runs", type=parse_count)
+_out = partial(_option, "--out", type=Path)
+_vary = partial(_option, "--vary", action="append", required=True)
+_replica = partial(_option, "--replica", type=parse_replica)
 
 
 def _confidence(default: float, what: str) -> Option:
     return _option("--confidence", f"probability {what}", type=float, default=default)
-
-
-def _out(text: str) -> Option:
-    return _option("--out", text, type=Path)
-
-
-def _vary(metavar: str, text: str) -> Option:
-    return _option("--vary", text, action="append", required=True, metavar=metavar)
-
-
-def _replica(text: str) -> Option:
-    return _option("--replica", text, type=parse_replica)
 
 
 CHANGES = "override a key of the scenario; VALUE is written as in TOML"
@@ -288,7 +265,7 @@ COMMANDS = (
         "run",
         "simulate a scenario and keep the results",
         (
-            _runs("number of independent runs (default: 1)", None),
+            _runs("number of independent runs (default: 1)"),
             _replica("run this replica of an ensemble (default: 0)"),
             SEED,
             ENGINE,
@@ -303,7 +280,7 @@ COMMANDS = (
         "plan",
         "write the directory of an ensemble that many jobs of a cluster simulate; nothing runs",
         (
-            _option("--runs", "number of independent runs", type=parse_count, required=True),
+            _runs("number of independent runs", required=True),
             SEED,
             ENGINE,
             _out("directory of the plan (default: runs/NAME-k)"),
@@ -353,7 +330,7 @@ COMMANDS = (
         "check",
         "compare simulations with theory, one row per promise",
         (
-            _runs("number of runs (default: 500, fewer of more than 100 nodes)", None),
+            _runs("number of runs (default: 500, fewer of more than 100 nodes)"),
             _option("--until", UNTIL, choices=["decided"]),
             _option("--most", "runs after which --until ends (default: 20000)", type=parse_count),
             SEED,
@@ -373,11 +350,11 @@ COMMANDS = (
         "simulate every point of a grid of parameters, one row per point",
         (
             _vary(
-                "KEY.PATH=V1,V2,...",
                 "values of a key, or START:STOP:COUNT; repeat it for a grid over several keys; all "
                 "on one truth, or the status says another",
+                metavar="KEY.PATH=V1,V2,...",
             ),
-            _runs("runs at each point", 1),
+            _runs("runs at each point", default=1),
             _out("directory (default: runs/NAME-sweep-k)"),
             NO_PLOT,
             *STUDY,
@@ -387,7 +364,7 @@ COMMANDS = (
         "size",
         "find the smallest (or largest) value of a key that meets a target",
         (
-            _vary("KEY.PATH=LOW:HIGH", "the key to search and its range"),
+            _vary("the key to search and its range", metavar="KEY.PATH=LOW:HIGH"),
             _option(
                 "--target",
                 "quantities: worst_rms, mean_rms, worst_trace, mean_trace, within_central, "
@@ -402,7 +379,7 @@ COMMANDS = (
                 "and simulation where the bound does not reach the target)",
                 choices=["theory", "simulation"],
             ),
-            _runs("at most this many runs per value (default: 1,000; small networks 10,000)", None),
+            _runs("at most this many runs per value (default: 1,000; small networks 10,000)"),
             _confidence(0.95, "that all decisions are right"),
             *STUDY,
         ),
@@ -411,7 +388,7 @@ COMMANDS = (
         "consistency",
         "test if P describes the errors: NEES and NIS against their expected values",
         (
-            _runs("number of runs", 50),
+            _runs("number of runs", default=50),
             _confidence(0.99, "that no consistent filter is called broken"),
             SEED,
             ENGINE,
@@ -449,7 +426,7 @@ COMMANDS = (
                 required=True,
                 metavar="F1,F2,...",
             ),
-            _runs("runs of each filter", 100),
+            _runs("runs of each filter", default=100),
             _confidence(0.95, "that all marks are right"),
             _out("directory for tables and a picture"),
             NO_PLOT,
@@ -581,8 +558,7 @@ COMMANDS = (
             SCENARIO[1],
             _runs(
                 "runs of each law, with parameters drawn from their posterior (default: 200, or "
-                "fewer if these take minutes)",
-                None,
+                "fewer if these take minutes)"
             ),
             _flag("--no-runs", "estimates and tests only"),
             _confidence(0.95, "that all intervals of links hold, and that no test is wrong"),

@@ -1,6 +1,7 @@
-"""Studies in a plan: ``--plan`` of their commands, and what ``netkf work`` and ``merge`` do then.
+"""``netkf plan``, ``work`` and ``merge``, and ``--plan`` of the commands of studies.
 
-All three run the study itself, on a pool whose results are files: see ``ensembles.planned_study``.
+Of a study all of them run it itself, on a pool whose results are files: see
+``ensembles.planned_study``.
 """
 
 from __future__ import annotations
@@ -9,15 +10,18 @@ import argparse
 import contextlib
 import filecmp
 import io
+import shlex
 import sys
 import time
 from bisect import bisect_right
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from netkf.cli.options import FAILED, print_notes
+from netkf.cli import pictures
+from netkf.cli.options import FAILED, MARGIN, load_scenario, print_notes
 from netkf.cli.progress import ProgressLine
 from netkf.core.errors import ScenarioError
 from netkf.core.printable import count_phrase
@@ -28,16 +32,146 @@ if TYPE_CHECKING:
     from netkf.ensembles.plans import Plan
     from netkf.ensembles.pools import PoolOptions
     from netkf.ensembles.replicas import Gap
+    from netkf.scenario.scenario import Scenario
 
 Run = Callable[[argparse.Namespace], int]
 SHOWN = 20  # ranges of missing runs that are listed
 WAIT_SECONDS = 2.0
 """Pause between two looks for the results of other jobs in a round."""
+ARRAY = """\
+#!/bin/bash
+#SBATCH --job-name={name}
+#SBATCH --array=0-{last}
+#SBATCH --cpus-per-task=1
+#SBATCH --time={hours:02d}:{minutes:02d}:00
+#SBATCH --signal=TERM@60
+#SBATCH --requeue
+#SBATCH --open-mode=append
+#SBATCH --output={log}
+
+# Each job takes the runs of its part that have no result yet. A job that is killed or requeued
+# goes on where it was, and a part that is finished is left alone.
+# Change {tasks} too for an array of all runs with another number of jobs.
+srun {work} --part "$SLURM_ARRAY_TASK_ID/{tasks}"
+status=$?
+# 1: the time was up before the part was finished.
+if [ $status -eq 1 ]; then scontrol requeue "${{SLURM_ARRAY_JOB_ID}}_${{SLURM_ARRAY_TASK_ID}}"; fi
+exit $status
+
+# When all are done: {merge}
+# It lists the jobs whose runs are missing; sbatch --array=3,7-9 submits those of a list again.
+"""
+TASKS = 64
+
+
+def run_plan(options: argparse.Namespace) -> int:
+    """``netkf plan``: write the directory of an ensemble for workers, and a script of an array."""
+    from netkf.ensembles.directory import EnsembleOptions
+    from netkf.ensembles.plans import plan_ensemble
+    from netkf.runs.directory_lock import lock_directory
+
+    with ProgressLine():
+        scenario = load_scenario(options)
+        tasks = min(options.tasks or TASKS, options.runs)
+        with lock_directory(options.out):
+            settings = EnsembleOptions(options.engine, options.trace)
+            directory = plan_ensemble(scenario, options.runs, options.out, settings, tasks)
+        _print_plan(directory, scenario, count_phrase(options.runs, "run"), tasks, options)
+    return 0
+
+
+def _print_plan(
+    directory: Path, scenario: Scenario, what: str, tasks: int, options: argparse.Namespace
+) -> None:
+    """Print what a plan holds and how to go on, and with ``--slurm`` the script of an array."""
+    print_notes(scenario.notes)
+    # With a script on standard output, what a person reads goes beside it.
+    out = sys.stderr if options.slurm else sys.stdout
+    print(f"{what} for {count_phrase(tasks, 'job')}, none of them simulated", file=out)
+    quoted = shlex.quote(str(directory)) + (" --trust" if options.trust else "")
+    print(f"each: netkf work {quoted}; in the end: netkf merge {quoted}", file=out)
+    print(f"written to {directory}", file=out)
+    if options.slurm:
+        print(_array(directory.resolve(), scenario.name, tasks, options), end="")
+
+
+def _array(directory: Path, name: str, tasks: int, options: argparse.Namespace) -> str:
+    """Return the submission script of an array of ``tasks`` SLURM jobs on a plan."""
+    trust = ["--trust"] if options.trust else []
+    minutes = round((options.time or 3600) / 60)
+    limit = f"{minutes - MARGIN}m"
+    return ARRAY.format(
+        name="".join(c if c.isalnum() or c in "-_." else "-" for c in f"netkf-{name}")[:100],
+        last=tasks - 1,
+        tasks=tasks,
+        hours=minutes // 60,
+        minutes=minutes % 60,
+        log=shlex.quote(str(directory.parent / f"{directory.name}-%A_%a.log")),
+        work=shlex.join(["netkf", "work", str(directory), "--for", limit, *trust]),
+        merge=shlex.join(["netkf", "merge", str(directory), *trust]),
+    )
+
+
+def run_work(options: argparse.Namespace) -> int:
+    """``netkf work``: simulate a part of a plan."""
+    from netkf.ensembles.parts import Part, part_of_array
+    from netkf.ensembles.plans import open_plan, work_on_plan
+    from netkf.ensembles.pools import PoolOptions
+
+    plan = open_plan(options.directory, options.trust)
+    part = Part(*options.part) if options.part else part_of_array(plan.tasks)
+    workers = None if options.scheduler else options.workers or 1
+    pool = PoolOptions(workers=workers, scheduler=options.scheduler)
+    if plan.arguments:
+        return work_on_study(plan, part, pool, options)
+    with ProgressLine() as line:
+        update = line.make_count_update("runs")
+        done = work_on_plan(plan, part, options.seconds, pool, update)
+    print_notes(plan.scenario.notes)
+    which = f"part {part.index}/{part.count}" if part.count > 1 else "all"
+    if not done.simulated and not done.left:
+        print(f"nothing left to do in {plan.directory} ({which})")
+        return 0
+    first, last = done.replicas[0], done.replicas[-1]
+    left = f"; {done.left:,} are left: run it again" if done.left else ""
+    print(f"{which}, runs {first:,} to {last:,}: {done.simulated:,} simulated{left}")
+    return FAILED if done.left else 0
+
+
+def run_merge(options: argparse.Namespace) -> int:
+    """``netkf merge``: turn the results of all workers of a plan into one ensemble or study."""
+    from netkf.ensembles.plans import open_plan
+
+    with ProgressLine():
+        plan = open_plan(options.directory, options.trust)
+        return (merge_study if plan.arguments else _merge_ensemble)(plan, options)
+
+
+def _merge_ensemble(plan: Plan, options: argparse.Namespace) -> int:
+    from netkf.cli.run import print_ensemble, print_summary
+    from netkf.ensembles.plans import merge_plan
+    from netkf.ensembles.replicas import Gap
+    from netkf.runs.directory_lock import lock_directory
+
+    if plan.is_merged:
+        print(f"nothing left to do in {plan.directory}")
+        return 0
+    draw = None
+    if not options.no_plot:
+        draw = partial(pictures.draw_picture, pictures.ENSEMBLE, plan.scenario)
+    with lock_directory(options.directory, option="DIR"):
+        merged = merge_plan(plan, options.mixed, finish=draw, note=lambda text: print_notes([text]))
+    runs = plan.identity.runs
+    if isinstance(merged, list):
+        _print_missing(plan, [Gap(1, runs, merged)])
+        return FAILED
+    print_summary(plan.scenario, merged)
+    print_ensemble(merged, runs)
+    return 0
 
 
 def plan_study(run: Run, options: argparse.Namespace) -> int:
     """Write the plan of the study that ``run`` does with these options; return the exit status."""
-    from netkf.cli.plan import TASKS, print_plan
     from netkf.ensembles.parts import Worker
     from netkf.ensembles.planned_study import PlannedStudy
     from netkf.ensembles.plans import write_study
@@ -64,7 +198,7 @@ def plan_study(run: Run, options: argparse.Namespace) -> int:
         what += f" of {len(runs):,} ensembles"
     if has_rounds(options):
         what += " in the first round"
-    print_plan(options.plan, options.loaded, what, tasks, options)
+    _print_plan(options.plan, options.loaded, what, tasks, options)
     return 0
 
 
@@ -119,7 +253,7 @@ def merge_study(plan: Plan, options: argparse.Namespace) -> int:
     gaps = _missing_runs(study_options.run, study_options, study)
     print_notes(study.worker.notes)
     if any(gap.missing for gap in gaps):
-        print_missing(plan, gaps, rounds)
+        _print_missing(plan, gaps, rounds)
         return FAILED
     if len(require_equal_installations(study.installations, plan.directory, options.mixed)) > 1:
         print_notes(["results are of machines of different kinds: last digits may be others"])
@@ -225,7 +359,7 @@ def _run_on(
         return run(options)
 
 
-def print_missing(plan: Plan, gaps: list[Gap], rounds: bool = False) -> None:
+def _print_missing(plan: Plan, gaps: list[Gap], rounds: bool = False) -> None:
     """Print which runs have no result, and what to do."""
     from netkf.ensembles.replicas import missing_ranges
 
