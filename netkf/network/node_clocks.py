@@ -82,8 +82,8 @@ class NodeTime(NamedTuple):
         """Return what the clock shows at ``time``, both in seconds."""
         return self.grid.instant(self.offset + self.pace * time)
 
-    def time_of(self, shown: float) -> float:
-        """Return the time at which the clock shows ``shown``, both in seconds."""
+    def time_of(self, shown: Any) -> Any:
+        """Return the time at which the clock shows ``shown``, or times (K,), both in seconds."""
         return (shown - self.offset) / self.pace
 
     def ahead(self, clock: Clock) -> float:

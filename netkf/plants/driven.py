@@ -197,7 +197,7 @@ class MovedReadings:
             y, H = self._path.reading(k, x + m), self._path.matrix(k)
             return _moved(y, H, m)
         y, H = self._path.reading(k, x + m)
-        return _moved(y, H, m), H if isinstance(H, np.ndarray) else MovedFunction(H, m)
+        return moved_reading(y, H, m)
 
     def covariance(self, k: int, R: FloatArray) -> FloatArray:
         """Return the covariance of reading number ``k``, see ``covariance_of``."""
@@ -207,8 +207,7 @@ class MovedReadings:
         """Yield y, H and covariance of each reading of a slot, see ``readings_of``."""
         m = self._m([slot])[0]
         for y, H, covariance in readings_of(self._path, slot, x + m, R):
-            is_linear = isinstance(H, np.ndarray)
-            yield _moved(y, H, m), H if is_linear else MovedFunction(H, m), covariance
+            yield *moved_reading(y, H, m), covariance
 
     def readings_at(self, slot: int, R: FloatArray) -> Any:
         """Return the readings of a nonlinear sensor in a slot, which no origin changes."""
@@ -226,6 +225,13 @@ class MovedReadings:
         """Return whitened readings (S, p) and H (S, p, n), see ``RecordedReadings``."""
         y, H = self._path.whitened(slots, R, p)
         return y - apply(H, self._m(slots)), H
+
+
+def moved_reading(y: FloatArray, H: Any, m: FloatArray) -> tuple[FloatArray, Any]:
+    """Return a reading y (p,) with H (p, n), or a function that linearises it, for states that are
+    counted from ``m`` (n,).
+    """
+    return _moved(y, H, m), H if isinstance(H, np.ndarray) else MovedFunction(H, m)
 
 
 def _moved(y: FloatArray, H: Any, m: FloatArray) -> FloatArray:

@@ -287,8 +287,9 @@ def _check_clocks(scenario: DerivedScenario) -> None:
     elif recorded:
         why, nodes = "cannot be of nodes whose readings are recorded, with their stamps", recorded
         remedy = "leave these out, and write into their tables the stamps that filters believe"
-    elif (scenario.plant.linear and scenario.knows_input) or len(scenario.followed_changes):
-        why = "cannot stand beside inputs or changes of a linear plant that filters know"
+    elif scenario.has_mistimed_increments and scenario.has_mistimed_models:
+        why = "cannot be of nodes whose sensors give increments, of a plant with known inputs or "
+        why += "changes"
     if clocks and why is not None:
         raise ScenarioError("network.clocks", why, sorted(nodes), remedy)
 

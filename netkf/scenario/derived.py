@@ -579,6 +579,12 @@ class DerivedScenario(ScenarioModel):
         return self.plant.input is not None and not self.filter.model.input
 
     @property
+    def has_mistimed_models(self) -> bool:
+        """True if nodes with wrong clocks know an input or changes of a linear plant."""
+        told = (self.plant.linear and self.knows_input) or len(self.followed_changes) > 0
+        return told and bool(self.network.clocks)
+
+    @property
     def tells_models(self) -> bool:
         """True if models tell filters of the input: those that do not commute with a shift."""
         return self.plant.linear and self.knows_input and not commutes(self.node_filter)

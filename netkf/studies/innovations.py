@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray, block_diagonal
+from netkf.network.node_clocks import node_time
 from netkf.plants.transitions import Transitions
 from netkf.rng.streams import Streams
 from netkf.scenario.sampling import sample_times
@@ -77,6 +78,8 @@ def has_clocked_innovations(scenario: Scenario) -> bool:
     plant: Any = scenario.plant
     if len(plant.changes) or scenario.misses_input or not scenario.is_random:
         return False
+    if scenario.has_mistimed_models:
+        return False
     known = all(map(np.array_equal, scenario.belief, (plant.A, plant.Q)))
     return known and bool(scenario.sampled_sensors)
 
@@ -123,17 +126,22 @@ class ClockedInnovations:
         if scenario.knows_input:
             x = x - scenario.believed_response.states(run.times)
         pairs = self._instants.get(scenario.nodes[i], np.empty((2, 0)))
+        clock = node_time(scenario, self._streams, scenario.nodes[i])
         for time, start in pairs.T.tolist():
             now, last = np.searchsorted(run.times, [time, start]).tolist()
             if time not in readings or now >= len(run.times) or blurred[last]:
                 continue
-            (F,), (root,) = self._moves.laws(np.array([time - start]))
+            # The node predicts over the time that passed by its clock.
+            gap = clock.shows(time) - clock.shows(start)
+            (F,), (root,) = self._moves.laws(np.array([gap]))
             moved, square = (x[now] - F @ x[last])[view], np.ix_(own, own)
             F, Q = F[view][:, view], (root @ root.T)[view][:, view]
             P = F @ run.P[last, i][square] @ F.T + Q
             if ROUNDING * abs(x[last]).max() * BLUR > np.sqrt(np.diag(P).min()):
                 continue
-            Sigma = None if self.sigma is None else F @ self.sigma[last, i][square] @ F.T + Q
+            Sigma = None
+            if self.sigma is not None and clock.pace == 1.0:
+                Sigma = F @ self.sigma[last, i][square] @ F.T + Q
             e = F @ run.error[last, i, own] + moved
             yield nis_of(readings[time], view, (e, P, Sigma))
 

@@ -1,6 +1,7 @@
 """Clocks of nodes that are wrong: ticks, stamps, and what filters make of them."""
 
 import bisect
+import functools
 import itertools
 
 import numpy as np
@@ -90,10 +91,15 @@ def local_lattice(node, period, horizon):
     return [float(one) for one in t if 1e-9 < one < horizon - 1e-9]
 
 
-def plain_run(times, horizon, delay):
+def undriven(x, P, start, gap):
+    return predict(x, P, gap)
+
+
+def plain_run(times, horizon, delay, move=undriven):
     """Estimates and covariances (T, 3, n) of the hybrid filter whose nodes measure time, and the
-    age of messages, by their own clocks.
+    age of messages, by their own clocks; ``move`` predicts from a time on over a gap.
     """
+    truth = lambda t: move(np.array([2.0, -3.0]), np.zeros((2, 2)), 0.0, t)[0]  # noqa: E731
     shows = lambda node, t: OFFSET[node] + (1.0 + DRIFT[node]) * t  # noqa: E731
     neighbours = {0: [1], 1: [0, 2], 2: [1]}
     events = [(t, 4, "probe", 0, None) for t in times]
@@ -107,7 +113,7 @@ def plain_run(times, horizon, delay):
     def advance(i, t):
         gap = shows(i, t) - now[i]
         if gap > 0.0:
-            state[i], now[i] = predict(*state[i], gap), shows(i, t)
+            state[i], now[i] = move(*state[i], now[i], gap), shows(i, t)
 
     while events:
         t, _, what, i, more = events.pop(0)
@@ -119,7 +125,7 @@ def plain_run(times, horizon, delay):
         advance(i, t)
         x, P = state[i]
         if what == "sample":
-            y = H @ scipy.linalg.expm(A * t) @ np.array([2.0, -3.0])
+            y = H @ truth(t)
             K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
             state[i] = x + K @ (y - H @ x), P - K @ H @ P
         elif what == "tick":
@@ -131,7 +137,7 @@ def plain_run(times, horizon, delay):
             # All messages of one instant together; here no two coincide at a node.
             _, stamp, payload = more
             age = min(max(shows(i, t) - stamp, 0.0), shows(i, t) - shows(i, 0.0))
-            told = predict(*payload, age) if age > 0.0 else payload
+            told = move(*payload, shows(i, t) - age, age) if age > 0.0 else payload
             state[i] = 0.7 * x + 0.3 * told[0], 0.7 * P + 0.3 * told[1]
     xhat, P = (np.array([[one[k] for one in row] for row in found]) for k in range(2))
     return xhat, P
@@ -146,6 +152,58 @@ def test_estimates_are_those_of_the_plain_recursion(scenario_of, delay, engine):
     np.testing.assert_allclose(run.xhat, xhat, rtol=1e-9, atol=1e-9)
     # Stamps are wrong by some seconds, so that errors do not fade.
     assert np.abs(run.x[-1] - run.xhat[-1]).max() > 0.05
+
+
+LATER_A = np.array([[-0.3, 0.5], [-1.5, 0.0]])
+JUMPS = ((0.5, 3.0), (1.1, -2.0), (2.9, 1.0))
+G = np.array([1.0, -0.5])
+
+
+def follow(x, P, start, gap, jumps=JUMPS, change=2.0):
+    """Predict with an input that jumps and a plant that changes; nothing drives before the first
+    jump.
+    """
+    edges = [start, *sorted(e for e in (change, *(t for t, _ in jumps)) if start < e < start + gap)]
+    for begin, end in itertools.pairwise([*edges, start + gap]):
+        M = LATER_A if begin >= change else A
+        u = next((value for t, value in reversed(jumps) if t <= begin), 0.0)
+        driven = np.zeros((3, 3))
+        driven[:2, :2], driven[:2, 2] = M, G * u
+        nested = np.block([[-M, BB], [np.zeros((2, 2)), M.T]])
+        F = scipy.linalg.expm(M * (end - begin))
+        Q = F @ scipy.linalg.expm(nested * (end - begin))[:2, 2:]
+        x = (scipy.linalg.expm(driven * (end - begin)) @ np.append(x, 1.0))[:2]
+        P = F @ P @ F.T + Q
+    return x, P
+
+
+DRIVEN = {
+    "plant.input": {"kind": "recorded", "path": "u.csv", "G": G[:, None].tolist()},
+    "plant.schedule": [{"from": 2.0, "A": LATER_A.tolist()}],
+}
+
+
+@pytest.mark.parametrize("keys", [("plant.input",), ("plant.schedule",), tuple(DRIVEN)])
+@pytest.mark.parametrize("delay", [0.13, 0.0])
+def test_what_filters_know_of_the_plant_is_of_local_times(scenario_of, delay, keys, tmp_path):
+    """Nodes expect inputs and changes when their clocks show their times. With an offset larger
+    than the delay some messages come from the future, and are taken for new.
+    """
+    rows = "".join(f"{t},{u}\n" for t, u in JUMPS)
+    (tmp_path / "u.csv").write_text("t,u0\n" + rows)
+    scenario = scenario_of(delay=delay).replace({key: DRIVEN[key] for key in keys})
+    with pytest.raises(netkf.EngineError, match="clocks that know inputs or changes"):
+        netkf.simulate(scenario, engine="compiled")
+    run = netkf.simulate(scenario, seed=1)
+    known = {"jumps": JUMPS if "plant.input" in keys else (), "change": np.inf}
+    if "plant.schedule" in keys:
+        known["change"] = 2.0
+    xhat, P = plain_run(run.times.tolist(), 6.0, delay, functools.partial(follow, **known))
+    np.testing.assert_allclose(run.P, P, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(run.xhat, xhat, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(run.error, run.x[:, None] - xhat, rtol=1e-9, atol=1e-9)
+    with pytest.raises(netkf.TheoryError, match="without inputs and changes"):
+        netkf.theory.error_covariance(scenario, run)
 
 
 def test_increments_are_taken_for_those_of_the_time_that_passed_by_the_clock(scenario_of):
@@ -393,7 +451,13 @@ def test_drawn_clocks_differ_by_node_and_run_and_have_their_law(scenario_of):
         ({"network.clocks": [{"nodes": [1], "offset": {"s": 1.0}}]}, "network.clocks[0].offset"),
         ({"network.clocks": {"nodes": [1]}}, "network.clocks"),
         ({"filter": {"kind": "central"}}, "network.clocks"),
-        ({"plant.input": {"kind": "constant", "G": [[1.0], [0.0]], "value": [1.0]}}, "clocks"),
+        (
+            {
+                "plant.input": {"kind": "constant", "G": [[1.0], [0.0]], "value": [1.0]},
+                "sensors": [{"nodes": [0, 1], "H": [[1.0, 0.0]], "R": [[1.0]]}],
+            },
+            "clocks",
+        ),
         ({"sensors": [{"kind": "recorded", "path": "y.csv", "H": [[1.0, 0.0]], "R": [[1.0]]}]},
          "got [2]; leave these out"),
     ],

@@ -82,6 +82,8 @@ class CompiledEngine(Engine):
             rule = f"a gate on {ungated}"
         elif scenario.has_mistimed_increments:
             rule = "sensors that give increments at nodes whose clocks are wrong"
+        elif scenario.has_mistimed_models:
+            rule = "nodes with wrong clocks that know inputs or changes of a linear plant"
         elif (outcomes := unknown_outcomes(scenario)) is not None:
             rule = outcomes
         if rule:

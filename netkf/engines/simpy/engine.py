@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -113,9 +113,11 @@ class _Simulation:
             # A pooled filter has the increment sensors of all nodes.
             placed = [(k, p) for k in sensing for p in scenario.increment_sensors.get(k, ())]
             sensors = increment_sensors(scenario, streams, placed)
-            clock = node_time(scenario, streams, node)
-            common = (timeline, self._recorder, truth, sensors, clock)
-            return ClockedNode(*common, *_identify(scenario, node, entity))
+            clock, response = node_time(scenario, streams, node), None
+            if scenario.network.clocks and scenario.input_responses is not None:
+                response = scenario.input_responses.believed
+            common = (timeline, self._recorder, truth, sensors, clock, response)
+            return ClockedNode(*common, *_identify(scenario, node, entity, clock.shows(0.0)))
 
         nodes = _nodes(scenario, make_node)
         self._begin_origins(nodes)
@@ -125,7 +127,7 @@ class _Simulation:
         return [
             self._sampling(truth, nodes, sums),
             self._moving_origin(truth, nodes),
-            *([self._changing(nodes)] if len(scenario.followed_changes) else []),
+            *self._changing(distinct(nodes)),
             *self._membership.processes(timeline, nodes),
             *sensor_processes(*shared, truth, nodes, self._membership.up),
             *clock_processes(*shared, self._transmitter, nodes),
@@ -140,11 +142,12 @@ class _Simulation:
         if responses is None or (believed := responses.believed) is None:
             return
 
-        def origin_of(sender: int) -> FloatArray:
-            states = believed.states(np.array([nodes[sender].estimates_at]))[0]
+        def origin_at(sender: int, when: float) -> FloatArray:
+            states = believed.states(np.array([when]))[0]
             return np.asarray(states[scenario.view(scenario.topology.index[sender])])
 
-        self._transmitter.origin_of = origin_of
+        self._transmitter.origin_at = origin_at
+        self._transmitter.estimates_at = lambda sender: nodes[sender].estimates_at
 
     def _append(self, row: Any) -> None:
         # A recorder that pauses has another ``append``.
@@ -170,12 +173,18 @@ class _Simulation:
             # Payloads under way refer to the old origin too.
             self._transmitter.shift(self._scenario.node_filter, offset)
 
-    def _changing(self, nodes: dict[int, ClockedNode]) -> Process:
-        for k, time in enumerate(self._scenario.followed_changes.tolist()):
-            yield self.timeline.at(time, Rank.REBASE, 0)
-            for node in distinct(nodes):
-                node.predict_to(time)
-                node.moving_model.begin(k + 1)
+    def _changing(self, nodes: list[ClockedNode]) -> Iterator[Process]:
+        """Yield a process for each node whose model changes, at times by its clock."""
+        changes = self._scenario.followed_changes
+        for node in nodes if len(changes) else ():
+            yield self._change(node, changes[node.moving_model.piece :])
+
+    def _change(self, node: ClockedNode, changes: FloatArray) -> Process:
+        times = node.times_of(changes)
+        for time in times[times < self._scenario.horizon].tolist():
+            yield self.timeline.at(time, Rank.REBASE, node.entity)
+            node.predict_to(time)
+            node.moving_model.begin(node.moving_model.piece + 1)
 
     def slots(self) -> list[Process]:
         """Return the SimPy processes of a scenario in slots."""
@@ -257,7 +266,7 @@ class _Simulation:
         if reach is not None and now < scenario.horizon:
             reach.look_at_all(int(when) if scenario.slotted else None, now)
         # By identity: a pooled filter is asked once, and its estimate serves all nodes.
-        estimate_by_state = {id(n): n.estimate() for n in distinct(nodes)}
+        estimate_by_state = {id(n): n.reported(now) for n in distinct(nodes)}
         estimates = [estimate_by_state[id(nodes[node])] for node in scenario.nodes]
         # The trace has absolute states. Adding the origin loses digits, so the error is computed
         # from local ones.
@@ -322,13 +331,17 @@ def _nodes(scenario: Scenario, make: Callable[[int, int, tuple[int, ...]], Any])
     return {node: make(node, entity, (node,)) for entity, node in enumerate(nodes)}
 
 
-def _identify(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
-    """Return the arguments of Node for ``node`` (id, -1: pooled) with index ``entity``."""
+def _identify(scenario: Scenario, node: int, entity: int, start: float = 0) -> tuple[Any, ...]:
+    """Return the arguments of Node for ``node`` (id, -1: pooled) with index ``entity``, whose clock
+    shows ``start`` seconds, or slots, at time 0.
+    """
     views = scenario.model_views
     view = None if node < 0 or views is None else views[entity]
     common = {i: entries for (i, j), entries in scenario.common_entries.items() if j == node}
     # -1: the pooled filter, which is not a node of the graph.
     model = scenario.model_of(entity)
+    if not scenario.slotted and len(changes := scenario.followed_changes):
+        model.begin(int((changes <= start).sum()))
     if scenario.tells_models:
         model = DrivenModel(scenario, model, view)
     if isinstance(model, MapModel | RateModel):
@@ -339,7 +352,7 @@ def _identify(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
         node,
         entity,
         model,
-        scenario.initial_estimate(scenario.nodes[entity]),
+        scenario.fresh_estimate(scenario.nodes[entity], start),
         scenario.node_infos[entity],
         spread_of(scenario.filter.linearise, scenario.plant.n if view is None else len(view)),
         None if view is None else View(view, scenario.layout.places, common),

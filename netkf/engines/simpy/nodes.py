@@ -32,8 +32,10 @@ from netkf.engines.simpy.driven import DrivenModel
 from netkf.engines.simpy.timeline import Timeline
 from netkf.linalg.arrays import FloatArray, block_diagonal
 from netkf.network.node_clocks import NodeTime
+from netkf.plants.driven import moved_reading
 from netkf.plants.nonlinear import linearise_by_points
 from netkf.plants.readings import Stacked
+from netkf.plants.response import Response
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES
 
@@ -233,6 +235,10 @@ class Node:
             self.model.move_to(start)
         self.state = self.algorithm.predict(self.state, gap)
 
+    def reported(self, time: float) -> tuple[FloatArray, FloatArray | None]:
+        """Return ``estimate()`` as it stands in a trace of ``time`` (seconds)."""
+        return self.estimate()
+
     def estimate(self) -> tuple[FloatArray, FloatArray | None]:
         """Return copies of the estimate (n,) and its covariance (n, n), None if it has none; raises
         ValueError if the filter gives others.
@@ -388,11 +394,15 @@ class ClockedNode(Node):
         truth: Any,
         increments: list[Any],
         clock: NodeTime,
+        response: Response | None,
         *arguments: Any,
     ) -> None:
+        """``response`` is that to the input which estimates are counted from: at the time of the
+        ``clock``, while all else is counted from it at the true time; None if they never differ.
+        """
         super().__init__(*arguments)
         self._timeline, self._recorder, self._truth = timeline, recorder, truth
-        self._increments, self._clock = increments, clock
+        self._increments, self._clock, self._response = increments, clock, response
         # The time in seconds by its clock, to which the filter is predicted, and that up to which
         # it has used increments.
         self._now, self._read_to = clock.shows(0.0), 0.0
@@ -406,8 +416,29 @@ class ClockedNode(Node):
 
     def restart(self, time: float, fresh: Callable[[float], tuple[FloatArray, FloatArray]]) -> None:
         """Begin again at ``time`` seconds with the estimate ``fresh(time)``."""
-        super().restart(time, fresh)
-        self._now, self._read_to = self._clock.shows(time), time
+        shown = self._clock.shows(time)
+        super().restart(shown, fresh)
+        self._now, self._read_to = shown, time
+
+    def ahead(self, time: float) -> FloatArray | None:
+        """Return by how much the origin of estimates is ahead of that of the truth at ``time``
+        (seconds), (n,) of the plant; None if they are one.
+        """
+        if self._response is None:
+            return None
+        shown, true = self._response.states(np.array([self._clock.shows(time), time]))
+        return np.asarray(shown - true)
+
+    def times_of(self, shown: FloatArray) -> FloatArray:
+        """Return when its clock shows ``shown`` (K,), both in seconds."""
+        return self._clock.grid.snap(self._clock.time_of(shown))
+
+    def reported(self, time: float) -> tuple[FloatArray, FloatArray | None]:
+        """Return ``estimate()`` counted from the origin of the truth at ``time`` (seconds)."""
+        (mean, cov), ahead = self.estimate(), self.ahead(time)
+        if ahead is not None:
+            mean += ahead if self.view is None else ahead[self.view.entries]
+        return mean, cov
 
     def set_up(self, up: bool, time: float) -> None:
         """Use increments from ``time`` (seconds) on, or no more; a filter that all nodes share has
@@ -466,6 +497,8 @@ class ClockedNode(Node):
         # The first sample of an instant schedules the update, which then uses all of them.
         if not self._samples and not self._pairs:
             self._timeline.call_at(self._timeline.now, Rank.UPDATE, self.entity, self._use_samples)
+        if (ahead := self.ahead(self._timeline.now)) is not None:
+            y, H = moved_reading(y, H, ahead)
         if self.view is not None:
             for part in self.view.readings(y, H, R):
                 if isinstance(part, PairReading):

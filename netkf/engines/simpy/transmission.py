@@ -99,8 +99,10 @@ class Transmitter:
         self._encoders = encoders(scenario, streams)
         # The last payload of each sender, as the filter made it and as it is received.
         self._encoded: dict[int, tuple[Any, Any]] = {}
-        # Where the coordinates of a sender (id) begin now, if they move along with an input.
-        self.origin_of: Callable[[int], FloatArray] | None = None
+        # Where the coordinates of a sender (id) begin at a time (seconds or slot), if they move
+        # along with an input, and when its estimate is of.
+        self.origin_at: Callable[[int, float], FloatArray] | None = None
+        self.estimates_at: Callable[[int], float]
         self._horizon, self._until = scenario.horizon, scenario.end_time
         self._instant = scenario.time_grid.instant
         # Of nodes that move: who hears whom. Set when the true state of the run is known.
@@ -194,7 +196,10 @@ class Transmitter:
             # The stored envelope may have been shifted since it was sent.
             envelope = self._under_way.pop((direction.link, envelope.number))
         age = self._instant(now - envelope.sent)
-        envelope = envelope._replace(age=self._stamped_age(direction.link, envelope.sent, age))
+        if self._clocks:
+            envelope = self._stamped(direction.link, envelope)
+        else:
+            envelope = envelope._replace(age=age)
         if not self.up(receiver):
             if now < self._horizon or envelope.sent == now:
                 self._recorder.append((now, LOST, sender, receiver, envelope.number, phase, NAN))
@@ -213,11 +218,12 @@ class Transmitter:
             return payload
         if sender not in self._encoded or self._encoded[sender][0] is not payload:
             encoder, encoded = self._encoders[sender], payload
-            if self.origin_of is None:
+            if self.origin_at is None:
                 encoded, clipped = encoder.encode(encoded)
             else:
                 # The numbers of the message are those of absolute states.
-                shift, origin = self._scenario.node_filter.shift, self.origin_of(sender)
+                shift = self._scenario.node_filter.shift
+                origin = self.origin_at(sender, self.estimates_at(sender))
                 encoded, clipped = encoder.encode(shift(encoded, origin))
                 encoded = shift(encoded, -origin)
             self._encoded[sender] = payload, encoded
@@ -226,13 +232,19 @@ class Transmitter:
                 self._recorder.append(row)
         return self._encoded[sender][1]
 
-    def _stamped_age(self, link: Link, sent: float, age: float) -> float:
-        """Return the age that its stamp tells the receiver, from 0 to the time since the start."""
-        if not self._clocks:
-            return age
-        (sender, receiver), now = (self._clocks[node] for node in link), self._timeline.now
-        told = self._instant(receiver.shows(now) - sender.shows(sent))
-        return min(max(told, 0.0), self._instant(receiver.shows(now) - receiver.shows(0.0)))
+    def _stamped(self, link: Link, envelope: Envelope) -> Envelope:
+        """Return a message with the age that its stamp tells the receiver, from 0 to the time since
+        the start.
+        """
+        sender, receiver = (self._clocks[node] for node in link)
+        now, stamp = receiver.shows(self._timeline.now), sender.shows(envelope.sent)
+        age = min(max(self._instant(now - stamp), 0.0), self._instant(now - receiver.shows(0.0)))
+        taken_for, payload = self._instant(now - age), envelope.payload
+        if self.origin_at is not None and taken_for != stamp:
+            # It is taken for one of another time than that which it is counted from.
+            origin, other = (self.origin_at(link[0], time) for time in (stamp, taken_for))
+            payload = self._scenario.node_filter.shift(payload, origin - other)
+        return envelope._replace(age=age, payload=payload)
 
     def shift(self, algorithm: Filter, offset: FloatArray) -> None:
         """Shift all messages under way by ``offset`` (n,), predicted back to the time of sending,
