@@ -157,11 +157,12 @@ def repeat(record: Any, h: int, run: Any, first: int) -> None:
     """Repeat the past events of node ``h`` from number ``first`` on, then predict to now."""
     x, root, past_x, past_root = record.xhat, record.root, record.past_x[h], record.past_root[h]
     y, H, gap, now = record.past_y[h], record.past_H[h], run.gap, run.now
-    last = record.kept[h, 0]
+    # Events have times since the start, at which the clock of the node may have shown another.
+    last, start = record.kept[h, 0], now - record.time[h, 0]
     copy_estimate(run, x, root, h, past_x, past_root, first - 1, True)
     for e in range(first, last):
-        run.now = record.past_time[h, e, 0]
-        run.gap = run.now - record.past_time[h, e - 1, 0]
+        run.now = start + record.past_time[h, e, 0]
+        run.gap = record.past_time[h, e, 0] - record.past_time[h, e - 1, 0]
         if run.gap > 0.0:
             predict_estimate(run.model, run, x, root, h, h)
         for i in range(record.past_rows[h, e, 0]):
@@ -171,11 +172,10 @@ def repeat(record: Any, h: int, run: Any, first: int) -> None:
             for i in range(len(run.size)):
                 x[h, i, 0] += y[e, i, 0]
         store_state(record, h, run, e)
-    run.now = record.time[h, 0]
-    run.gap = run.now - record.past_time[h, last - 1, 0]
+    run.now, run.gap = now, record.time[h, 0] - record.past_time[h, last - 1, 0]
     if run.gap > 0.0:
         predict_estimate(run.model, run, x, root, h, h)
-    run.gap, run.now = gap, now
+    run.gap = gap
 
 
 @kernel

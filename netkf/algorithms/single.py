@@ -85,6 +85,13 @@ class Payload:
         """Return a payload with these ``fields``, of the axes of those here."""
         return Payload(fields, self.reading, self.sender)
 
+    def with_moved_reading(self, offset: FloatArray) -> Payload:
+        """Return a payload whose reading is of states to which ``offset`` (n,) was added."""
+        if self.reading is None:
+            return self
+        y, H = self.reading.y, self.reading.H
+        return self.with_reading(self.reading._replace(y=y + H @ offset))
+
     def with_reading(self, reading: Whitened) -> Payload:
         """Return a payload with another reading."""
         return Payload(self.fields, reading, self.sender)

@@ -206,6 +206,62 @@ def test_what_filters_know_of_the_plant_is_of_local_times(scenario_of, delay, ke
         netkf.theory.error_covariance(scenario, run)
 
 
+CURVED = """import numpy as np
+
+A = np.array({A})
+
+
+class Flow:
+    def f(self, x, u, t):
+        return A @ x + np.array({G}) * u[0]
+
+    def jacobian(self, x, u, t):
+        return A
+"""
+RANGES = {"kind": "range", "positions": [[1.0, 5.0], [0.0, 7.0], [4.0, -9.0]]}
+SLEEPS = [{"kind": "duty", "nodes": [1, 2], "period": 1.3, "up": 0.8, "memory": "lost"}]
+
+
+@pytest.mark.parametrize(
+    ("kind", "at", "sensor", "lives"),
+    [
+        ("kcf", "nodes", {"H": H.tolist()}, []),
+        ("intermittent", "readings", {"H": H.tolist()}, []),
+        ("gossip", "links", RANGES, SLEEPS),
+    ],
+)
+def test_linear_plants_are_those_whose_f_is_linear(
+    scenario_of, tmp_path, kind, at, sensor, lives, monkeypatch
+):
+    """Estimates of a plant that is not linear are counted from no response to the input."""
+    (tmp_path / "u.csv").write_text("t,u0\n" + "".join(f"{t},{u}\n" for t, u in JUMPS))
+    (tmp_path / "curved.py").write_text(CURVED.format(A=A.tolist(), G=G.tolist()))
+    monkeypatch.syspath_prepend(tmp_path)
+    every = {"nodes": [0, 1, 2], "R": [[1e-22]], "sampling": PERIODIC}
+    small = {
+        "B": np.diag([1e-10, 1e-10]).tolist(),
+        "mean": [2.0, -3.0],
+        "cov": np.diag([1e-20] * 2),
+    }
+    scenario = scenario_of(delay=0.13 if kind == "kcf" else 0.4, horizon=4.0).replace(
+        {
+            "plant": {"kind": "diffusion", "A": A.tolist(), "input": DRIVEN["plant.input"]} | small,
+            "sensors": [every | sensor],
+            "network.activation": {"kind": "readings"} if at == "readings"
+            else {"kind": "periodic", "period": 0.3, "at": at},
+            "network.lives": lives,
+            "filter": {"kind": kind, "mean": [0.5, 0.0], "cov": [[1.0, 0.2], [0.2, 2.0]],
+                       "model": {"B": [[0.2, 0.0], [0.0, 1.0]], "R": [[0.3]]}} | MORE.get(kind, {}),
+        }
+    )  # fmt: skip
+    recorded = {"kind": "recorded", "path": "u.csv"}
+    flow = {"kind": "nonlinear", "f": "curved:Flow", "step": 1e-3, **small, "input": recorded}
+    run, other = (netkf.simulate(s) for s in (scenario, scenario.replace({"plant": flow})))
+    assert len(run.log) == len(other.log)
+    np.testing.assert_allclose(run.P, other.P, atol=1e-5)
+    np.testing.assert_allclose(run.xhat, other.xhat, atol=1e-5)
+
+
 def test_increments_are_taken_for_those_of_the_time_that_passed_by_the_clock(scenario_of):
     """dy = H x dt without noise: by a clock that shows s = offset + pace t it is H x / pace ds."""
     scenario = scenario_of(filter_="local", horizon=4.0).replace(

@@ -11,6 +11,7 @@ import numpy as np
 import simpy
 
 from netkf.algorithms.filter import Filter
+from netkf.algorithms.single import Payload
 from netkf.engines.base import Rank
 from netkf.engines.reach import Reach
 from netkf.engines.simpy.nodes import Envelope
@@ -244,6 +245,8 @@ class Transmitter:
             # It is taken for one of another time than that which it is counted from.
             origin, other = (self.origin_at(link[0], time) for time in (stamp, taken_for))
             payload = self._scenario.node_filter.shift(payload, origin - other)
+            if isinstance(payload, Payload):
+                payload = payload.with_moved_reading(origin - other)
         return envelope._replace(age=age, payload=payload)
 
     def shift(self, algorithm: Filter, offset: FloatArray) -> None:
