@@ -23,15 +23,12 @@ from netkf.ensembles.block_files import (
 )
 from netkf.ensembles.moments import Moments
 from netkf.ensembles.replicas import Node
-from netkf.ensembles.statistics import MESSAGES, RunStatistics, Trace, merge
+from netkf.ensembles.statistics import MESSAGES, PARTS, RunStatistics, Trace, merge
 from netkf.runs.documents import DamagedError
 from netkf.runs.files import BLOCKS_FOLDER
 from netkf.runs.quantities import ensemble_names
 from netkf.scenario.scenario import Scenario
 from netkf.trace.schema import EVENT
-
-PARTS = "samples", "averages", "messages", "quantities"
-"""Attributes of RunStatistics that are Moments."""
 
 
 class BlockCheckpoints(BlockFiles):
@@ -198,14 +195,12 @@ def _restore_statistics(arrays: Any) -> RunStatistics:
 
     texts = _read_texts(arrays)
     return RunStatistics(
-        samples=moments("samples"),
-        averages=moments("averages"),
-        messages=moments("messages"),
-        quantities=moments("quantities"),
+        **{name: moments(name) for name in PARTS},
         totals=arrays["totals"],
         conserved={
             name: (moments(f"conserved_{name}"), float(d)) for name, d in texts["conserved"].items()
         },
         rounding_from=float(texts["rounding_from"]),
         fingerprint=str(texts["fingerprint"]),
+        traces=(),
     )

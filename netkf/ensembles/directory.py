@@ -94,11 +94,10 @@ def runs_to_directory(
     summary.json and the events and states of the traced runs; return the ensemble, or None if
     ``out`` was complete before.
 
-    Blocks of runs are stored in the directory as they complete. When resuming, the stored blocks
-    are not simulated again, and all files are bit-identical to those without interruption. Blocks
-    that are damaged or belong to another run are simulated again, and ``note`` is called with a
-    line about them. ``finish`` writes further files, before the manifest states that the directory
-    is complete.
+    Blocks of runs are stored as they complete, and are not simulated again on resuming: all files
+    are bit-identical to those without interruption. ``note`` is called with a line about blocks
+    that are damaged or of another run. ``finish`` writes further files, before the manifest states
+    that the directory is complete.
 
     Raises ScenarioError and EngineError before anything is written; later WriteError, EngineError
     if a plugged-in class fails, and InterruptedRunError (a KeyboardInterrupt) when interrupted.
@@ -132,13 +131,7 @@ def runs_to_directory(
 
 def identify_runs(scenario: Scenario, runs: int, trace: str, engine: str) -> RunIdentity:
     """Return the identity of the blocks of ``runs`` runs of a scenario."""
-    return RunIdentity(
-        scenario=scenario_digest(scenario),
-        seed=scenario.seed,
-        runs=runs,
-        trace=trace,
-        engine=engine,
-    )
+    return RunIdentity(scenario_digest(scenario), scenario.seed, runs, trace, engine)
 
 
 def _open_directory(
@@ -170,15 +163,9 @@ def write_files(
     promised = promise_traces(scenario, scenario.times)
     summary = summarise_ensemble(scenario, statistics, promised)
     write_json(directory / "summary.json", summary)
-    return FinishedEnsemble(
-        directory,
-        "diverged" if ensemble.diverged else "complete",
-        summary,
-        ensemble,
-        promised,
-        writer.simulated,
-        time.perf_counter() - started,
-    )
+    status, seconds = "diverged" if ensemble.diverged else "complete", time.perf_counter() - started
+    results = summary, ensemble, promised, writer.simulated
+    return FinishedEnsemble(directory, status, *results, seconds)
 
 
 class DirectoryWriter:
@@ -222,20 +209,12 @@ class DirectoryWriter:
     def simulate(self, engine: Engine, pool: Pool, progress: Progress | None) -> RunStatistics:
         """Return the statistics of all runs: stored blocks are read, others simulated."""
         plan = self.plan
-        store = BlockStore(
-            {node: partial(self.blocks.load, node) for node in self.known},
-            self._add,
-            plan.max_block,
-        )
+        known = {node: partial(self.blocks.load, node) for node in self.known}
+        store = BlockStore(known, self._add, plan.max_block)
+        task = partial(block_statistics, engine=engine, traces=plan.traces)
         with writing_at_last(partial(self.blocks.write, plan)):
             statistics: RunStatistics = replicate_blocks(
-                partial(block_statistics, engine=engine, traces=plan.traces),
-                merge,
-                self.scenario,
-                plan.runs,
-                pool=pool,
-                progress=progress,
-                store=store,
+                task, merge, self.scenario, plan.runs, pool=pool, progress=progress, store=store
             )
         return statistics
 
@@ -262,9 +241,8 @@ class DirectoryWriter:
             self.blocks.write(self.plan)
         self.note("failed" if isinstance(error, Exception) else "interrupted", error)
         if isinstance(error, KeyboardInterrupt):
-            return InterruptedRunError(
-                self.directory, f"; go on with --resume --out {self.directory}"
-            )
+            remedy = f"; go on with --resume --out {self.directory}"
+            return InterruptedRunError(self.directory, remedy)
         return explain_failure(self.scenario, error, self.directory)
 
     def end(
@@ -273,11 +251,8 @@ class DirectoryWriter:
         """Write the final manifest, after which ``note`` writes nothing any more; ``machines`` are
         those that simulated the runs if it was not this one.
         """
-        entries = self._identity_entries(
-            # totals: numbers of events and of diverged runs
-            diverged=int(statistics.totals[1]),
-            events=int(statistics.totals[0]),
-        )
+        events, diverged = statistics.totals.tolist()
+        entries = self._identity_entries(diverged=diverged, events=events)
         entries["fingerprint"] = statistics.fingerprint
         if machines:
             entries["machine"] = machines[0]

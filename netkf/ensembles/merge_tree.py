@@ -14,9 +14,7 @@ Merge = Callable[[Any, Any], Any]
 
 
 class MergeTree:
-    """Merges the results of blocks, added in any order, with their neighbours as soon as both are
-    there. Added in order, only about log2(blocks) results wait at a time.
-    """
+    """Merges results of blocks, added in any order, with neighbours as soon as both are there."""
 
     def __init__(self, merge: Merge) -> None:
         self._merge = merge
@@ -52,9 +50,7 @@ class MergeTree:
 
 
 def aligned_pieces(first: int, stop: int) -> Iterator[tuple[int, int]]:
-    """Yield the largest nodes of the binary tree that cover the leaves ``first`` .. ``stop - 1``;
-    node (level, k) covers the leaves k 2^level .. (k + 1) 2^level - 1.
-    """
+    """Yield the largest nodes (level, k) that cover the leaves ``first`` .. ``stop - 1``."""
     while first < stop:
         level = (stop - first).bit_length() - 1
         # A node may begin only at a multiple of its size.

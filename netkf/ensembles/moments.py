@@ -26,9 +26,7 @@ class Moments(NamedTuple):
     M2: FloatArray
 
     def standard_error(self) -> FloatArray:
-        """Return the standard error of the mean (S, C); nan where there are fewer than
-        two values.
-        """
+        """Return the standard error of the mean (S, C); nan of fewer than two values."""
         size = self.size[:, None]
         with np.errstate(invalid="ignore", divide="ignore"):
             variance = self.M2 / np.where(size > 1.0, size - 1.0, np.nan)
@@ -54,9 +52,7 @@ def _in_columns(values: FloatArray) -> FloatArray:
 
 
 def merge_moments(a: Moments, b: Moments) -> Moments:
-    """Return the moments of the observations of ``a`` and ``b`` together; both have S rows and C
-    columns.
-    """
+    """Return the moments of the observations of ``a`` and ``b`` (S rows, C columns) together."""
     size, mean, M2 = (np.array(pair) for pair in zip(a, b, strict=True))
     join_nodes(size, _in_columns(mean), _in_columns(M2), 2, 1)
     return Moments(size[0], mean[0], M2[0])

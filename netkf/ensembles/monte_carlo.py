@@ -148,12 +148,7 @@ def monte_carlo(
 
 
 def ensemble_of(scenario: Scenario, statistics: RunStatistics, seed: int, engine: str) -> Ensemble:
-    """Return the ensemble that the ``statistics`` of all runs describe: means over runs of P and of
-    e e' (T, N, n, n), e the error, and of NEES (T, N), averages over time, and counts.
-
-    ``seed`` and ``engine`` (its name) are those of the runs. Errors and NEES are nan from the time
-    on at which rounding blurs them in some run.
-    """
+    """Return the ensemble that the ``statistics`` of all runs of this ``seed`` describe."""
     # Columns of the samples: for each node the upper triangles of P and e e', and NEES.
     samples, shape = statistics.samples, (len(scenario.times), len(scenario.nodes), -1)
     means = np.where(samples.size[:, None] > 0.0, samples.mean, np.nan)
@@ -203,9 +198,8 @@ def _unpack_samples(values: FloatArray, n: int) -> tuple[FloatArray, FloatArray,
 
 
 def ensemble_table(ensemble: Ensemble) -> dict[str, np.ndarray]:
-    """Return the columns (T N,) of ensemble.parquet by name, with one row for each of T times and,
-    within it, each of N nodes: means and standard errors of P, and with ground truth of e e' (e is
-    the error) and NEES.
+    """Return the columns (T N,) of ensemble.parquet by name, a row for each time and node; without
+    ground truth those of P alone.
     """
     n, rows = ensemble.mean_P.shape[-1], len(ensemble.times) * len(ensemble.nodes)
     i, j = np.triu_indices(n)

@@ -48,13 +48,7 @@ class ArrayVariables:
 
 
 ARRAYS = (
-    ArrayVariables(
-        "SLURM_ARRAY_TASK_ID",
-        "SLURM_ARRAY_TASK_MIN",
-        "SLURM_ARRAY_TASK_MAX",
-        "SLURM_ARRAY_TASK_STEP",
-        "SLURM_ARRAY_TASK_COUNT",
-    ),
+    ArrayVariables(*(f"SLURM_ARRAY_TASK_{name}" for name in ("ID", "MIN", "MAX", "STEP", "COUNT"))),
     ArrayVariables("PBS_ARRAY_INDEX"),
     ArrayVariables("SGE_TASK_ID", "SGE_TASK_FIRST", "SGE_TASK_LAST", "SGE_TASK_STEPSIZE"),
     ArrayVariables("LSB_JOBINDEX", last="LSB_JOBINDEX_END", step="LSB_JOBINDEX_STEP"),
@@ -65,9 +59,8 @@ def part_of_array(tasks: int, environment: Mapping[str, str] = os.environ) -> Pa
     """Return the part of this job of an array by the variables of SLURM, PBS, Grid Engine or LSF;
     without such variables the whole.
 
-    Where the system does not tell the number of jobs, or its indices have gaps or begin later than
-    at 1, as when some jobs of an array are submitted again, the array is that of ``tasks`` jobs for
-    which the plan is.
+    Where the system does not tell the number of jobs, or its indices have gaps or begin after 1, as
+    when some jobs are submitted again, the array is that of ``tasks`` jobs for which the plan is.
     """
 
     def read(name: str, default: int) -> int:
@@ -143,22 +136,15 @@ class Worker:
         try:
             with writing_at_last(partial(blocks.write, identity)):
                 yield BlockStore(
-                    {node: partial(blocks.load, node) if returns else _nothing for node in known},
+                    # Without results nothing stands for each of them, and is merged.
+                    {n: partial(blocks.load, n) if returns else lambda: None for n in known},
                     add,
                     identity.max_block,
                     replicas,
                     # The next block may take as long as the slowest.
                     lambda: time.monotonic() + self._slowest > self.deadline or is_over(),
-                    None if returns else _merge_nothing,
+                    None if returns else lambda _a, _b: None,
                 )
         finally:
             if not is_over():
                 blocks.write(identity)
-
-
-def _nothing() -> None:
-    """Stand for the result of a stored block, which a worker does not need."""
-
-
-def _merge_nothing(a: None, b: None) -> None:
-    """Merge two of them."""

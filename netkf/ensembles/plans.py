@@ -19,6 +19,7 @@ from netkf.core.fields import one_of, require_runs
 from netkf.ensembles.block_files import RunIdentity
 from netkf.ensembles.checkpoints import BlockCheckpoints
 from netkf.ensembles.directory import (
+    DEFAULTS,
     TRACES,
     DirectoryWriter,
     EnsembleOptions,
@@ -64,7 +65,7 @@ def plan_ensemble(
     scenario: Scenario,
     runs: int,
     out: Path | None = None,
-    options: EnsembleOptions = EnsembleOptions(),  # noqa: B008 - it is immutable
+    options: EnsembleOptions = DEFAULTS,
     tasks: int = 1,
 ) -> Path:
     """Write the directory of an ensemble of ``runs`` runs, none of them simulated, and return its
@@ -123,21 +124,15 @@ def open_plan(directory: Path, trust: bool = False) -> Plan:
         listed = ", ".join(f"{k} {present.get(k)} instead of {planned.get(k)}" for k in names)
         rule = "was planned with other versions, and results would differ in their last digits"
         raise ScenarioError("DIR", rule, listed, "use the same installation")
-    identity = RunIdentity(
-        scenario=manifest["scenario"],
-        seed=manifest["seed"],
-        runs=manifest["runs"]["wanted"],
-        trace=manifest.get("trace", "first"),
-        engine=manifest["engine"],
-    )
+    runs, trace = manifest["runs"]["wanted"], manifest.get("trace", "first")
+    digest, seed, engine = (manifest[key] for key in ("scenario", "seed", "engine"))
+    identity = RunIdentity(digest, seed, runs, trace, engine)
     tasks, arguments = manifest.get("tasks", 1), manifest.get("arguments", ())
     return Plan(directory, scenario, identity, tasks, is_merged, arguments)
 
 
 class WorkDone(NamedTuple):
-    """What a worker did: its replicas, and the numbers of runs that it simulated and that are left
-    of them.
-    """
+    """The replicas of a worker, and how many of them it simulated and are left."""
 
     replicas: range
     simulated: int
@@ -154,9 +149,9 @@ def work_on_plan(
     """Simulate the runs of a ``part`` of a plan that have no result yet, for so many ``seconds`` at
     most, and write their results.
 
-    Results are merged before they are written. Several workers on one part do its work twice and no
-    harm. Raises InterruptedRunError (a KeyboardInterrupt) when interrupted: what was finished is
-    written then. Raises EngineError if a plugged-in class fails, and WriteError.
+    Several workers on one part do its work twice and no harm. Raises InterruptedRunError (a
+    KeyboardInterrupt) when interrupted, with what was finished written, EngineError if a plugged-in
+    class fails, and WriteError.
     """
     replicas, identity, scenario = part.of(plan.identity.runs), plan.identity, plan.scenario
     if plan.is_merged or not replicas:
@@ -196,11 +191,10 @@ def merge_plan(
     """Write the files of the ensemble from the results of all workers; return it, or the ranges of
     replicas without a result, and then nothing is written.
 
-    The files are those of ``netkf run --runs`` on the machine of the workers, to the last bit. With
-    ``mixed`` results may come from machines of different kinds, whose last digits may differ: the
-    manifest then lists them. ``finish`` writes further files; ``note`` is called with lines about
-    files that are not used. Raises ScenarioError for results of other versions, or of different
-    machines unless they may be mixed, and WriteError.
+    The files are those of ``netkf run --runs`` on the machine of the workers, to the last bit; with
+    ``mixed`` the machines may be of different kinds, which the manifest lists. ``finish`` writes
+    further files; ``note`` is called with lines about files that are not used. Raises ScenarioError
+    as ``require_equal_installations``, and WriteError.
     """
     started = time.perf_counter()
     writer = DirectoryWriter(plan.scenario, plan.directory, plan.identity, plan.tasks)

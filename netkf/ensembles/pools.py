@@ -30,7 +30,6 @@ WARM, SAVING = 0.2, 2.0
 """Seconds of work in this process after which the total time is estimated; and the estimated saving
 in seconds above which worker processes are started, about the cost of starting them.
 """
-
 PATIENCE = 8
 """Seconds to wait for a scheduler."""
 CLOSE_SECONDS = 2.0
@@ -145,7 +144,6 @@ class ExecutorPool(RemotePool):
         self.width = workers or getattr(executor, "_max_workers", None) or cores()
 
     def _send(self, job: Job) -> Future[BlockResult]:
-        """Submit a block; return its future."""
         return self._executor.submit(work, job)
 
 
@@ -157,7 +155,9 @@ class DaskPool(RemotePool):
 
     def __init__(self, address: str) -> None:
         super().__init__()
-        _check_address(address)
+        is_plain = str(address) == address and address.isprintable() and " " not in address
+        if not (is_plain and 0 < len(address) <= MAX_ADDRESS):
+            raise ScenarioError("scheduler", "must be an address", address, "give tcp://HOST:PORT")
         try:
             import distributed
         except ImportError:
@@ -189,7 +189,6 @@ class DaskPool(RemotePool):
         return pack_scenario(scenario)._replace(versions=tuple(versions().items()))
 
     def _send(self, job: Job) -> Future[BlockResult]:
-        """Submit a block; return its future."""
         future: Future[BlockResult] = self._executor.submit(work, job)
         return future
 
@@ -213,13 +212,6 @@ class DaskPool(RemotePool):
         """Leave the scheduler."""
         self._executor.shutdown(wait=False)
         self._client.close(timeout=CLOSE_SECONDS)
-
-
-def _check_address(address: object) -> None:
-    """Raise ScenarioError unless the value can be the address of a scheduler."""
-    plain = isinstance(address, str) and address.isprintable() and " " not in address
-    if not (plain and 0 < len(str(address)) <= MAX_ADDRESS):
-        raise ScenarioError("scheduler", "must be an address", address, "give tcp://HOST:PORT")
 
 
 def _unreachable(address: str, reason: str) -> ScenarioError:
@@ -280,9 +272,8 @@ def make_pool(blocks: int, options: PoolOptions = ANYWHERE, open_ended: bool = F
             raise ScenarioError("executor", "must not be a Dask client", executor, remedy)
         if isinstance(executor, type) or not hasattr(executor, "submit"):
             remedy = "give a ThreadPoolExecutor, a ProcessPoolExecutor, or one like them"
-            raise ScenarioError(
-                "executor", "must be a concurrent.futures.Executor", executor, remedy
-            )
+            rule = "must be a concurrent.futures.Executor"
+            raise ScenarioError("executor", rule, executor, remedy)
         return ExecutorPool(executor, count)
     if scheduler is not None:
         return DaskPool(scheduler)

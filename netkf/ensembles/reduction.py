@@ -67,14 +67,9 @@ class ReducedSamples(Struct):
 
 
 def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
-    """Return averages of each of the R runs of a batch, and moments of the samples over the runs of
-    each of ``pieces``: adjacent slices that cover all runs, each a node of the binary tree along
-    which the runs of an ensemble are merged.
-
-    The columns of the moments are, for each filter, the upper triangles of P and of e e' (e is the
-    error) and the NEES. The averages of a run are its mean square error, mean trace of P and mean
-    NEES over the samples after time 0. The last sample of a run that diverged, whose numbers are
-    broken, is left out.
+    """Return values of the runs of a batch, with moments over the runs of each of ``pieces``:
+    adjacent slices that cover all runs, each a node of the binary tree along which runs are merged.
+    The last sample of a run that diverged, whose numbers are broken, is left out.
     """
     runs, count, filters, n = batch.error.shape
     kept = batch.lengths - batch.diverged

@@ -131,10 +131,9 @@ def replicate_blocks(
     runs - 1``, merged by ``merge(a, b)``, which joins the results of neighbours (a before b) into
     one of the same kind.
 
-    Results are merged in the binary tree over replicas, inside blocks by the task itself: the
-    result has the same bits for every number of workers, size of blocks and order of completion.
-    ``task`` and ``merge`` are functions of a module, or partials of such, that workers can import;
-    their results must pickle.
+    Results are merged in the binary tree over replicas, inside blocks by the task itself. ``task``
+    and ``merge`` are functions of a module, or partials of such, that workers can import; their
+    results must pickle.
 
     seed     : defaults to the scenario's
     pool     : a pool of make_pool, or options for one that is closed at the end
@@ -236,9 +235,8 @@ def _complete_blocks(pool: Pool, blocks: Iterator[Job]) -> Iterator[tuple[Job, B
                 yield block, done
     except BrokenExecutor as error:
         message = "workers ended again and again before their runs were done; perhaps the memory is"
-        raise EngineError(
-            f"{message} too small, or a class of the scenario ends the process"
-        ) from error
+        why = f"{message} too small, or a class of the scenario ends the process"
+        raise EngineError(why) from error
     except CancelledError:
         raise EngineError("the executor was shut down before its runs were done") from None
     finally:

@@ -25,6 +25,8 @@ from netkf.trace.recorder import MemorySink, Recorder, Sink
 from netkf.trace.schema import KINDS
 
 MESSAGES = ("sent", "delivered", "lost", "in_flight", "transmissions")
+PARTS = ("samples", "averages", "messages", "quantities")
+"""Attributes of RunStatistics that are Moments."""
 
 
 class Trace(NamedTuple):
@@ -83,10 +85,7 @@ def merge(a: RunStatistics, b: RunStatistics) -> RunStatistics:
         for name, (sums, drift) in a.conserved.items()
     }
     return RunStatistics(
-        samples=merge_moments(a.samples, b.samples),
-        averages=merge_moments(a.averages, b.averages),
-        quantities=merge_moments(a.quantities, b.quantities),
-        messages=merge_moments(a.messages, b.messages),
+        **{name: merge_moments(getattr(a, name), getattr(b, name)) for name in PARTS},
         totals=a.totals + b.totals,
         conserved=conserved,
         rounding_from=min(a.rounding_from, b.rounding_from),
@@ -191,12 +190,8 @@ class RunValues(NamedTuple):
 def run_values(
     batch: RunBatch, scenario: Scenario, network: FloatArray | None = None, first: int = 0
 ) -> RunValues:
-    """Return what statistics need of the R runs of a batch: averages over time (R, N + 1, 3) of
-    squared error, trace of P and NEES, of each node and of all, counts of messages (R, 5), and
-    moments of the samples.
-
-    ``network`` are the quantities of their networks, if they are wanted, and ``first`` is the index
-    of the batch's first run in the binary tree over all runs.
+    """Return what statistics need of the R runs of a batch, with the quantities ``network`` if they
+    are wanted; ``first`` is the index of its first run in the binary tree over all runs.
     """
     # The largest nodes of the tree that consist of runs of this batch.
     indices = [(k << level, level) for level, k in aligned_pieces(first, first + len(batch))]
@@ -242,11 +237,7 @@ def _quantities(
 
 
 def merge_runs(values: RunValues, piece: int) -> RunStatistics:
-    """Return the statistics of the runs ``values.pieces[piece]`` of a batch, a node of the binary
-    tree over all runs, along which they are merged.
-
-    The fingerprint and the traces are empty; ``block_statistics`` adds them.
-    """
+    """Return the statistics of ``values.pieces[piece]``, without fingerprint and traces."""
     runs = values.pieces[piece]
     samples, parts = values.samples[piece], (values.averages, values.quantities, values.messages)
     columns = [part[runs].reshape(len(part[runs]), -1) for part in parts]
@@ -283,11 +274,8 @@ def merge_runs(values: RunValues, piece: int) -> RunStatistics:
 
 
 def count_messages(counts: np.ndarray, slotted: bool) -> FloatArray:
-    """Return the numbers (R, 5) of messages that were sent, delivered, lost and in flight at the
-    end, and of transmissions (one broadcast sends several messages), in R runs.
-
-    They come from the numbers of events by kind, ``counts`` (R, len(KINDS)). Transmissions are nan
-    if runs are ``slotted``: slots have no transmit events.
+    """Return the numbers MESSAGES (R, 5) of R runs from numbers of events by kind, ``counts`` (R,
+    len(KINDS)). Transmissions are nan if runs are ``slotted``: slots have no transmit events.
     """
     events = dict(zip(KINDS, counts.T.astype(np.float64), strict=True))
     sent, delivered, lost = events["send"], events["deliver"], events["lost"] + events["late"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from netkf.core.printable import shorten
 from netkf.ensembles.checkpoints import BlockCheckpoints
 from netkf.ensembles.monte_carlo import Ensemble, ensemble_of
 from netkf.ensembles.statistics import MESSAGES, merge
-from netkf.linalg.arrays import FloatArray, from_upper
+from netkf.linalg.arrays import from_upper
 from netkf.network.graphs import name_rows
 from netkf.runs.documents import COUNT, NUMBER, DamagedError, check_files
 from netkf.runs.files import scenario_digest
@@ -61,18 +62,11 @@ class StoredEnsemble(WithPromises, Ensemble):
 
 
 def read_ensemble(directory: Path, scenario: Scenario, manifest: dict[str, Any]) -> StoredEnsemble:
-    """Return the ensemble that netkf run left in a directory; the caller has checked that its
-    ``manifest`` (manifest.json) has the right keys and types.
-
-    An interrupted ensemble, which has no ensemble.parquet yet, has the runs of its finished blocks
-    (files with the results of some consecutive replicas).
-    Raises DamagedError for files that are not as netkf writes them.
+    """Return the ensemble that netkf run left in a directory, whose ``manifest`` has the right keys
+    and types; of an interrupted one the runs of finished blocks. Raises DamagedError.
     """
-    stored: dict[str, Any] = {
-        "directory": directory,
-        "manifest": manifest,
-        "status": str(manifest["status"]),
-    }
+    stored: dict[str, Any] = {"directory": directory, "manifest": manifest}
+    stored["status"] = str(manifest["status"])
     if not (directory / "ensemble.parquet").exists():
         ensemble = _of_blocks(directory, scenario, manifest)
         values: dict[str, Any] = {f.name: getattr(ensemble, f.name) for f in fields(Ensemble)}
@@ -84,7 +78,12 @@ def read_ensemble(directory: Path, scenario: Scenario, manifest: dict[str, Any])
     rows = [*summary["nodes"], summary["overall"]]
     if [row["node"] for row in summary["nodes"]] != list(scenario.nodes):
         raise DamagedError("summary.json has other nodes than the scenario")
-    average, se_average = _read_averages(rows)
+    names = "mean_sq_error", "mean_trace", "mean_nees"
+    # Means (N + 1, 3) over time and runs, and their standard errors.
+    average, se_average = (
+        np.array([[row.get(name + ending) for name in names] for row in rows], dtype=np.float64)
+        for ending in ("", "_se")
+    )
     runs, messages = summary["runs"], summary["messages"]
     blurred = summary.get("rounding_from")
     return StoredEnsemble(
@@ -108,24 +107,12 @@ def read_ensemble(directory: Path, scenario: Scenario, manifest: dict[str, Any])
 
 def _of_blocks(directory: Path, scenario: Scenario, manifest: dict[str, Any]) -> Ensemble:
     blocks = BlockCheckpoints(directory, scenario)
-    blocks_statistics = blocks.readable(scenario_digest(scenario), int(manifest["seed"]))
-    if not blocks_statistics:
+    found = blocks.readable(scenario_digest(scenario), int(manifest["seed"]))
+    if not found:
         raise DamagedError("no run of it was finished")
-    statistics = blocks_statistics[0]
-    for block in blocks_statistics[1:]:
-        statistics = merge(statistics, block)
-    return ensemble_of(scenario, statistics, int(manifest["seed"]), str(manifest.get("engine", "")))
-
-
-def _read_averages(rows: list[dict[str, Any]]) -> tuple[FloatArray, FloatArray]:
-    """Return means (N + 1, 3) of square error, trace of P and NEES over time and runs."""
-
-    def column(name: str) -> FloatArray:
-        return np.array([row.get(name) for row in rows], dtype=np.float64)
-
-    names = "mean_sq_error", "mean_trace", "mean_nees"
-    means, errors = [column(name) for name in names], [column(f"{name}_se") for name in names]
-    return np.column_stack(means), np.column_stack(errors)
+    return ensemble_of(
+        scenario, reduce(merge, found), int(manifest["seed"]), str(manifest.get("engine", ""))
+    )
 
 
 def _read_samples(path: Path, scenario: Scenario) -> dict[str, Any]:

@@ -23,11 +23,8 @@ from netkf.scenario.usage import record_usage
 def summarise_ensemble(
     scenario: Scenario, statistics: RunStatistics, promised: PromisedTraces
 ) -> dict[str, Any]:
-    """Return the content of an ensemble's summary.json, with the keys of one run's summary.
-
-    ``rms_error`` is the root of the mean square error of all runs; a key that ends in ``_se`` is a
-    standard error. ``promised`` are the traces of covariances that theory promises: the bound on
-    the mean of P over time, its limit, and that of a centralised filter.
+    """Return the content of an ensemble's summary.json, with the keys of one run's summary, and
+    standard errors under those that end in ``_se``.
     """
     # (N + 1, 3): of each node and of all, the mean square error, mean trace of P and mean NEES.
     mean = statistics.averages.mean.reshape(-1, 3)

@@ -151,9 +151,7 @@ class ProcessPool(RemotePool):
 
     def _hand_out(self) -> None:
         while self._waiting:
-            worker = next(
-                (candidate for candidate in self._workers if candidate.task is None), None
-            )
+            worker = next((one for one in self._workers if one.task is None), None)
             if worker is None and len(self._workers) >= self.width:
                 return
             task = self._waiting.popleft()
@@ -162,11 +160,9 @@ class ProcessPool(RemotePool):
                 continue  # it was cancelled
             if worker is None:
                 # Without a class of the user's script (__main__) workers need not run it again.
-                scenario = task.job.scenario
-                is_free = (
-                    isinstance(scenario, PackedScenario) and b"__main__" not in scenario.payload
-                )
-                worker = _Worker(hide_main=is_free)
+                packed = task.job.scenario
+                hide = isinstance(packed, PackedScenario) and b"__main__" not in packed.payload
+                worker = _Worker(hide)
                 self._workers.append(worker)
             try:
                 worker.send(task)

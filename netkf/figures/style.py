@@ -27,7 +27,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.runs.files import write_atomically
 
 BLUE, VERMILLION, GREEN, PURPLE, INK, ORANGE, SKY, MUTED = (one.colour for one in SERIES)
-FAINT, YELLOW = "#bbbbbb", "#F0E442"
+FAINT = "#bbbbbb"
 SENSING, RELAY, EXACT, LOST = VERMILLION, SKY, GREEN, VERMILLION
 """Colours of nodes with and without a sensor, of exact values of theory, and of lost messages."""
 SEQUENTIAL = "cividis_r"
