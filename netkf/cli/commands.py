@@ -18,8 +18,7 @@ from netkf.figures.names import FIGURE_NAMES, FIT_FIGURES, FORMATS
 
 ENGINES = ("auto", "simpy", "processes", "compiled")
 ONE_THREAD = ("check", "work", "merge")
-"""Commands whose last digits must not depend on whether a run is simulated here or in a worker
-process, whose LAPACK has one thread.
+"""Commands whose runs have the same last digits here and in workers, whose LAPACK has one thread.
 """
 SHARED = {
     **dict.fromkeys(("compare", "consistency", "import", "innovations", "new"), "short"),
@@ -307,10 +306,7 @@ COMMANDS = (
                 dest="seconds",
                 metavar="DURATION",
             ),
-            (
-                _option("--workers", "number of processes (default: 1)", type=parse_workers),
-                POOL[1],
-            ),
+            (_option("--workers", "number of processes (default: 1)", type=parse_workers), POOL[1]),
             _trust("DIR"),
         ),
         takes_scenario=False,

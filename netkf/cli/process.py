@@ -182,9 +182,7 @@ def end_later(status: int, seconds: float, message: str = "") -> None:
 
 
 def end_process(status: int) -> NoReturn:
-    """Run the functions of ``atexit``, flush the streams and end the process, without waiting for
-    threads, as ``sys.exit`` would.
-    """
+    """Run the functions of ``atexit``, flush the streams and end without waiting for threads."""
     end_later(status, EXIT_SECONDS)
     # Nothing is imported here: if the module is missing, no server was started.
     process_start = sys.modules.get("netkf.ensembles.process_start")

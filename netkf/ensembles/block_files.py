@@ -117,10 +117,7 @@ class BlockFiles(ABC):
         """
 
     def find(
-        self,
-        identity: RunIdentity,
-        any_installation: bool = False,
-        within: range | None = None,
+        self, identity: RunIdentity, any_installation: bool = False, within: range | None = None
     ) -> tuple[list[Node], list[str]]:
         """Return the largest nodes (replicas start, ..., ``size`` of them) that are stored of the
         runs with this ``identity``, in order, and lines for the user about files that are

@@ -17,14 +17,7 @@ from netkf.ensembles.block_files import BlockFiles, RunIdentity, open_block
 from netkf.ensembles.blocks import Job
 from netkf.ensembles.merge_tree import Merge
 from netkf.ensembles.parts import Worker
-from netkf.ensembles.replicas import (
-    BlockStore,
-    Form,
-    Gap,
-    MissingRunsError,
-    Node,
-    missing_ranges,
-)
+from netkf.ensembles.replicas import BlockStore, Form, Gap, MissingRunsError, Node, missing_ranges
 from netkf.runs.documents import DamagedError
 from netkf.runs.files import BLOCKS_FOLDER, scenario_digest
 from netkf.scenario.scenario import Scenario

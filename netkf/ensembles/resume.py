@@ -94,10 +94,7 @@ def is_finished(out: Path | None, scenario: Scenario, plan: RunIdentity) -> bool
 
 
 def clear_unfinished_runs(
-    directory: Path,
-    scenario: Scenario,
-    replica: int = 0,
-    note: Callable[[str], None] | None = None,
+    directory: Path, scenario: Scenario, replica: int = 0, note: Callable[[str], None] | None = None
 ) -> bool:
     """Remove the files of a single run, number ``replica``, that was stopped, so that ``--resume``
     can do it again; return False if it is finished and stays.

@@ -9,13 +9,7 @@ import numpy as np
 from netkf.ensembles.statistics import MESSAGES, RunStatistics
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.quantities import ensemble_names, quantity_rows
-from netkf.runs.summary import (
-    CONFIDENCE,
-    PromisedTraces,
-    nees_bounds,
-    node_rows,
-    summary_notes,
-)
+from netkf.runs.summary import CONFIDENCE, PromisedTraces, nees_bounds, node_rows, summary_notes
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.usage import record_usage
 

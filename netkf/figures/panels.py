@@ -155,9 +155,7 @@ def _draw_bound(axes: Any, times: FloatArray, roots: FloatArray) -> None:
 
 
 def nees_interval(n: int, runs: int) -> tuple[float, float]:
-    """Return ``nees_bounds``, to 12 digits, of few degrees of freedom without scipy.special, whose
-    import takes longer than a panel.
-    """
+    """Return ``nees_bounds``, if it can without scipy.special, whose import takes 0.2 s."""
     freedom, tail = runs * n, 0.5 * (1.0 - CONFIDENCE)
     if freedom > MAX_FREEDOM:
         return nees_bounds(n, runs)

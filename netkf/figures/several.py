@@ -128,9 +128,7 @@ def _headline(curves: Sequence[ErrorCurve]) -> str:
     return f"{sentence}; {last} {worst:.3g}" if math.isfinite(worst) else sentence
 
 
-def curves_of(
-    results: Sequence[Any] | Mapping[str, Any],
-) -> tuple[tuple[ErrorCurve, ...], str]:
+def curves_of(results: Sequence[Any] | Mapping[str, Any]) -> tuple[tuple[ErrorCurve, ...], str]:
     """Return the curves of results by label, or by what tells them apart: filters, scenarios or
     numbers; and a sentence on the runs. Raises ScenarioError.
     """

@@ -185,10 +185,7 @@ def _draw_sweep_map(axes: Any, table: Any, keys: list[str], unit: str) -> None:
     is_log = positive.size and positive.max() > LOG_RATIO * positive.min()
     norm = "log" if is_log else "linear"
     image = axes.imshow(errors, aspect="auto", origin="lower", cmap=SEQUENTIAL, norm=norm)
-    for group, marker, label in (
-        (diverged, "x", "runs diverged"),
-        (unbounded, "o", "no bound"),
-    ):
+    for group, marker, label in ((diverged, "x", "runs diverged"), (unbounded, "o", "no bound")):
         rows, columns = np.nonzero(group)
         if len(rows):
             style = {"marker": marker, "ls": "", "ms": 8, "mec": LOST, "mfc": "none", "mew": 1.5}

@@ -76,9 +76,7 @@ class Picture(Figure):
 
 @contextlib.contextmanager
 def style_context() -> Iterator[None]:
-    """Set the style of netkf's figures within the block, whatever the user's settings are; a block
-    within such a block has it already.
-    """
+    """Set the style of netkf's figures within the block, whatever the user's settings are."""
     if _is_styled:
         yield
         return

@@ -218,9 +218,14 @@ def links_figure(data: FigureData) -> Picture:
     return finish_figure(figure, data.title(headline), data.caption(note))
 
 
+def messages_by_direction(messages: np.ndarray) -> list[np.ndarray]:
+    """Return those of the MESSAGE rows (M,) with an outcome, by direction."""
+    return list(by_link(messages[messages["outcome"] != UNDER_WAY]))
+
+
 def _require_messages(data: FigureData) -> list[np.ndarray]:
-    """Return the messages with an outcome by direction; raises UnavailableError without any."""
-    directions = list(by_link(data.joined[data.joined["outcome"] != UNDER_WAY]))
+    """Return the messages by direction; raises UnavailableError without any."""
+    directions = messages_by_direction(data.joined)
     if not directions:
         raise UnavailableError("No message was delivered or lost.")
     return directions

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -27,16 +27,11 @@ FURTHEST = 3.0
 """Tolerances at which the axis ends."""
 
 
-class _Mark(NamedTuple):
-    """How rows of a verdict are drawn, and what the legend calls them."""
-
-    colour: str
-    marker: str
-    label: str
-
-
-MARKS = {HOLDS: _Mark(EXACT, "o", "holds"), BROKEN: _Mark(LOST, "X", "BROKEN")}
-OTHER = _Mark(MUTED, "s", "undecided")
+MARKS, OTHER = (
+    {HOLDS: (EXACT, "o", "holds"), BROKEN: (LOST, "X", "BROKEN")},
+    (MUTED, "s", "undecided"),
+)
+"""Colours, markers and names of verdicts."""
 
 
 def verdict_picture(path: Path, verdict: Verdict, claim: str) -> bool:
@@ -51,8 +46,8 @@ def verdict_picture(path: Path, verdict: Verdict, claim: str) -> bool:
         axes = figure.add_subplot()
         for height, row in enumerate(reversed(rows)):
             _draw_row(axes, height, row)
-        for mark in dict.fromkeys(MARKS.get(row.verdict, OTHER) for row in rows):
-            axes.plot([], [], color=mark.colour, marker=mark.marker, label=mark.label)
+        for colour, marker, label in dict.fromkeys(MARKS.get(row.verdict, OTHER) for row in rows):
+            axes.plot([], [], color=colour, marker=marker, label=label)
         axes.plot([], [], "|", color=INK, label="would have been seen")
         axes.axvline(1.0, color=INK, lw=0.8, ls=":", label="tolerated")
         axes.set_yticks(
@@ -77,10 +72,10 @@ def verdict_picture(path: Path, verdict: Verdict, claim: str) -> bool:
 
 def _draw_row(axes: Any, height: int, row: Evidence) -> None:
     # The interval low, high of a row is of the margin, which is minus the distance.
-    mark, unit = MARKS.get(row.verdict, OTHER), row.tolerance
+    (colour, marker, _), unit = MARKS.get(row.verdict, OTHER), row.tolerance
     low, high = max(0.0, -row.high) / unit, min(max(0.0, -row.low) / unit, 2.0 * FURTHEST)
-    axes.plot([low, high], [height, height], color=mark.colour, lw=3.0, solid_capstyle="butt")
-    style = {"marker": mark.marker, "color": mark.colour, "ms": 4.5, "mec": INK, "mew": 0.5}
+    axes.plot([low, high], [height, height], color=colour, lw=3.0, solid_capstyle="butt")
+    style = {"marker": marker, "color": colour, "ms": 4.5, "mec": INK, "mew": 0.5}
     axes.plot([min(row.off / unit, FURTHEST)], [height], **style)
     if np.isfinite(row.detectable):
         detectable = min(row.detectable / unit, FURTHEST)

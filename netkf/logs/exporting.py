@@ -1,6 +1,4 @@
-"""``netkf export``: a run as a packet log, which ``netkf import`` replays, and as a scenario of
-what happened in it: both to the bit.
-"""
+"""``netkf export``: a run as a packet log, and as a scenario of what happened: both to the bit."""
 
 from __future__ import annotations
 

@@ -113,9 +113,7 @@ class LogFit(NotebookTable):
 
 
 def read_fit(directory: Path) -> SimpleNamespace:
-    """Return the ``envelope`` that ``netkf fit`` left in a directory, as in :class:`LogFit`; raises
-    ScenarioError for a damaged file.
-    """
+    """Return the ``envelope`` that ``netkf fit`` left in a directory; raises ScenarioError."""
     path = directory / FIT_FILE
     try:
         table = pd.read_csv(path)
@@ -199,9 +197,8 @@ def fit_log(
 
 
 def read_outcomes(scenario: Scenario) -> tuple[pd.DataFrame, list[str]]:
-    """Return recorded outcomes by message, with how many their link ``sent``, and notes. Packets
-    that nobody reported count as lost: those left were all heard by somebody, which would bias
-    deliveries. Raises ScenarioError.
+    """Return recorded outcomes by message, with how many their link ``sent``, and notes. What
+    nobody reported counts as lost: without it deliveries would be too high. Raises ScenarioError.
     """
     loss = scenario.network.channel.loss
     if not isinstance(loss, RecordedLoss):
@@ -267,11 +264,7 @@ def _read_table(path: Path) -> pd.DataFrame:
 
 
 def _complete_replay(
-    folder: Path,
-    scenario: Scenario,
-    table: pd.DataFrame,
-    links: pd.DataFrame,
-    notes: list[str],
+    folder: Path, scenario: Scenario, table: pd.DataFrame, links: pd.DataFrame, notes: list[str]
 ) -> Scenario:
     """Return the scenario with unknown outcomes drawn once, by the deliveries of their links."""
     missing = int(links["unknown"].sum())

@@ -288,9 +288,7 @@ def long_run_sum(units: FloatArray, lags: int) -> float:
 
 
 def lagged_products(outcomes: LogOutcomes, lag: int) -> tuple[FloatArray, float]:
-    """Return products of residuals ``lag`` transmissions apart (T,), and their sum for a
-    correlation of 1.
-    """
+    """Return products of residuals ``lag`` sends apart (T,), and the sum for a correlation of 1."""
     units, scale = [], 0.0
     for group in outcomes.groups:
         z, known = group.residuals, np.isfinite(group.x)

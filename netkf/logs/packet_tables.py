@@ -53,9 +53,7 @@ SYNONYMS = {
     "node": ("id", "mote"),
     "peer": ("neighbour", "neighbor", "other"),
 }
-"""Names of each column, the first of which in a table counts; in any case, and with _id, _no, _s,
-_ms, _us or _ns at the end.
-"""
+"""Names of each column, the first of which in a table counts; in any case, with ENDINGS."""
 ENDINGS = ("_id", "_no", "_number", "_s", "_ms", "_us", "_ns")
 SENT = ("tx", "send", "sent", "transmit", "broadcast", "out")
 HEARD = ("rx", "receive", "received", "recv", "heard", "hear", "deliver", "delivered", "in")
@@ -79,9 +77,8 @@ class _Rows(NamedTuple):
 
 
 def read_tables(log: Path, columns: Mapping[str, str]) -> PacketLog:
-    """Return the packet log of a table, or of a folder: packets.csv, or else all tables but
-    positions.csv and readings.csv. ``columns`` has names of columns by names in SYNONYMS. Raises
-    ScenarioError.
+    """Return the packet log of a table, or of a folder: packets.csv, or all tables but EXTRAS;
+    ``columns`` has names of columns by names in SYNONYMS. Raises ScenarioError.
     """
     notes: list[str] = []
     tables = _rename({path: read_text_rows(path) for path in _packet_paths(log)}, columns)
@@ -500,9 +497,7 @@ def _merge_rows(rows: pd.DataFrame, notes: list[str], log: str) -> pd.DataFrame:
 
 
 def read_log_positions(path: Path, origin: Decimal, notes: list[str]) -> pd.DataFrame:
-    """Return a table node, x, y, or t (s from ``origin``), node, x, y of nodes that move; raises
-    ScenarioError.
-    """
+    """Return node, x, y, or t (s from ``origin``), node, x, y where nodes move (ScenarioError)."""
     raw = read_text_rows(path)
     stamp, name = find_column(raw, "t"), find_column(raw, "node") or raw.columns[0]
     columns = {}

@@ -24,17 +24,13 @@ from netkf.core.stamps import UNITS, TimeBase
 from netkf.linalg.arrays import FloatArray
 
 HOLE = 30.0
-"""A receiver that reports nothing has a hole in its log after so many packets that it would have
-heard by its usual deliveries.
-"""
+"""Packets that a silent receiver would have heard, after which its log has a hole."""
 USUAL = 0.1
 """The smallest delivery of a sender whose silence says something."""
 MODULI = sorted([*(2**k for k in (*range(4, 17), 24, 32)), 100, 1000, 10_000])
 """Lengths after which counters of packets begin again."""
 MAX_SKIP = 1000
-"""Numbers skipped at once beyond which a counter began again: nothing is known of what lies
-between.
-"""
+"""Numbers skipped at once beyond which a counter began again."""
 TOLD, UNREPORTED = "no report tells", "nobody reported it"
 NOT_LOGGED = "its sender logs what it sends, and not this"
 """Reasons for which outcomes are not known."""
@@ -192,9 +188,8 @@ def choose_origin(stamps: list[Decimal], resolution: float) -> Decimal:
 
 
 def find_lead(numbers: FloatArray, times: FloatArray, who: np.ndarray) -> FloatArray:
-    """Return how far the stamps (K,) of one sender's packets, in order of time, are ahead of those
-    by reporter 0, by what two say of one number; 0 if that is less than half of what lies between
-    packets.
+    """Return how far the stamps (K,) of a sender's packets, by time, are ahead of those by reporter
+    0, by what two say of one number; 0 if that is less than half of what lies between packets.
     """
     order = np.lexsort((times, numbers))
     t, same, by = times[order], np.diff(numbers[order]) == 0, who[order]

@@ -33,9 +33,7 @@ UNUSUAL_SHARE = 0.9
 MIN_AGES = 10
 """Samples that a node needs before one of its ages of information is compared with the others."""
 ARRIVAL_DEVIATIONS = 4.0
-"""Standard deviations by which a node's delivery ratio must differ from that of all nodes to be
-mentioned.
-"""
+"""Standard deviations from which on a delivery ratio of a node differs from that of all."""
 ROUNDING = 1e-9
 """Relative excess of a bound that rounding explains."""
 MAX_LISTED = 4

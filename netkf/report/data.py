@@ -54,8 +54,7 @@ def run_data(
     packer: Packer,
 ) -> dict[str, Any]:
     """Return the data of a run for the live views as JSON values, with columns in ``packer``:
-    innovations ``readings`` or the reason for none, ``layout`` positions; ``budget`` limits
-    numbers.
+    innovations ``readings`` or why there are none, positions ``layout``, numbers in the ``budget``.
     """
     worst = None if source.worst is None else source.worst.explained
     horizon = float(source.scenario.horizon)

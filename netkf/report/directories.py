@@ -124,9 +124,7 @@ class ReportSource:
         return float(self.scenario.slot_plant.period) if self.scenario.slotted else 0.0
 
     def cutoffs(self, times: FloatArray) -> FloatArray:
-        """Return the latest arrivals (T,) that estimates at ``times`` (T,) include, by
-        ``knowledge``.
-        """
+        """Return the latest arrivals (T,) that estimates at ``times`` (T,) include."""
         knowledge = self.knowledge
         if knowledge == "until":  # under clocks: all that arrived by then
             return times
@@ -141,9 +139,8 @@ class ReportSource:
 def read_source(
     directory: Path, replica: int | str | None = None, trust: bool = False
 ) -> ReportSource:
-    """Return the contents of a directory of netkf. ``replica`` chooses a run of an ensemble, by
-    number, or ``"worst"`` or ``"median"`` by RMS error; ``trust`` imports classes. Raises
-    ScenarioError.
+    """Return the contents of a directory of netkf, and the ``replica`` of an ensemble, by number,
+    "worst" or "median" by RMS error; ``trust`` imports classes. Raises ScenarioError.
     """
     stored = open_directory(directory, trust=trust)
     label, text = str(directory), (directory / "scenario.toml").read_text(encoding="utf-8")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -22,21 +22,6 @@ CONFIDENCE = 0.99
 """Probability that the intervals of all nodes contain their means if P is exact."""
 
 
-class NodeMeans(NamedTuple):
-    """The mean NIS of M nodes with readings, divided by the degrees of freedom.
-
-    nodes     : (M,) ids, -1 for readings that one filter uses together
-    means     : (M,) sums of NIS divided by the number of scalar readings, 1 on average if P is
-                exact
-    low, high : (M,) limits that hold for all nodes with probability CONFIDENCE if P is exact
-    """
-
-    nodes: np.ndarray
-    means: FloatArray
-    low: FloatArray
-    high: FloatArray
-
-
 def read_innovations(source: ReportSource) -> Innovations | str | None:
     """Return the innovations of a source's run, by a replay, the reason for none, or None."""
     if source.run is None or not len(source.run.times):
@@ -49,8 +34,10 @@ def read_innovations(source: ReportSource) -> Innovations | str | None:
         return str(error)
 
 
-def node_means(readings: Innovations) -> NodeMeans:
-    """Return mean NIS per scalar reading (M,) of M nodes, with limits (M,) if P is exact."""
+def node_means(readings: Innovations) -> tuple[np.ndarray, FloatArray, FloatArray, FloatArray]:
+    """Return ids (M,), -1 for readings that one filter uses together, mean NIS per scalar reading,
+    and its limits if P is exact, which hold for all nodes with probability CONFIDENCE.
+    """
     finite = np.isfinite(readings.nis)
     nodes, columns = np.unique(readings.nodes[finite], return_inverse=True)
     # Numbers of scalar readings, the degrees of freedom, and sums of NIS of each node.
@@ -61,7 +48,7 @@ def node_means(readings: Innovations) -> NodeMeans:
     # Sums of NIS are chi-square if P is exact. Nodes share the noise of the plant, so the sums are
     # dependent: Bonferroni's inequality makes the limits hold together.
     low, high = chi_square_interval(freedom, 1.0 - (1.0 - CONFIDENCE) / max(1, len(nodes)))
-    return NodeMeans(nodes, sums / freedom, low, high)
+    return nodes, sums / freedom, low, high
 
 
 def describe_innovations(readings: Innovations, scenario: Scenario) -> str:
@@ -109,9 +96,8 @@ def _judge_mean(mean: float, low: float, high: float) -> str:
 def innovation_columns(
     readings: Innovations | str | None, run: StoredRun, max_readings: int, packer: Packer
 ) -> dict[str, Any] | None:
-    """Return NIS of readings as columns added to ``packer``, means and autocorrelations by node,
-    thinned to ``max_readings``; nodes by index in ``run.nodes``, -1 for all. None without
-    innovations.
+    """Return NIS of readings as columns added to ``packer``, thinned to ``max_readings``, means and
+    autocorrelations by index in ``run.nodes``, -1 for all. None without innovations.
     """
     if not isinstance(readings, Innovations):
         return None

@@ -1,13 +1,10 @@
-"""What would have reduced the worst error of a run: replays in which missing messages arrive, and
-the centralised filter.
-"""
+"""What would have reduced the worst error of a run: missing messages, and all readings at once."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 import shlex
-from typing import NamedTuple
 
 import numpy as np
 
@@ -79,18 +76,9 @@ def describe_mending(explanation: Why) -> str:
     return f"With no message missing it would be no better: a replay gives {change}"
 
 
-class CentralSample(NamedTuple):
-    """Trace of P and length of the error of the centralised filter at the worst sample of a run;
-    the error is nan without ground truth.
-    """
-
-    trace: float
-    error: float
-
-
-def central_sample(source: ReportSource) -> CentralSample | None:
-    """Return the centralised filter's sample at the time of the worst sample, with truth and
-    readings of the run; None without messages, or if the scenario does not allow it.
+def describe_central(source: ReportSource, explanation: Why) -> str | None:
+    """Return sentences on the price of the network: the worst sample beside that of the centralised
+    filter on truth and readings of the run; None without messages, or if it cannot run.
     """
     run = source.run
     if source.worst is None or run is None or not run.scenario.filter.algorithm.timing.talks:
@@ -106,19 +94,14 @@ def central_sample(source: ReportSource) -> CentralSample | None:
         return None
     node = run.nodes.index(source.worst.explained.node)
     error = math.sqrt(central_run.sq_error[row, node]) if run.truth_known else math.nan
-    return CentralSample(float(traces(central_run.P[row, node])), error)
-
-
-def describe_central(source: ReportSource, explanation: Why, central: CentralSample) -> str:
-    """Return sentences on the price of the network: the worst sample beside the central one."""
-    best = explanation.what_ifs[-1]
-    numbers = [f"trace P {format_number(central.trace)}"] if math.isfinite(central.trace) else []
-    numbers += [f"error {format_number(central.error)}"] if math.isfinite(central.error) else []
+    trace, best = float(traces(central_run.P[row, node])), explanation.what_ifs[-1]
+    numbers = [f"trace P {format_number(trace)}"] if math.isfinite(trace) else []
+    numbers += [f"error {format_number(error)}"] if math.isfinite(error) else []
     sentence = (
         "With all readings at once: the centralised filter, on the same truth and readings, had "
         f"{' and '.join(numbers)} then"
     )
-    if not central.trace < best.trace * (1.0 - SAME_NUMBERS):
+    if not trace < best.trace * (1.0 - SAME_NUMBERS):
         return f"{sentence}. Its trace P is no less than that of this node with no message missing"
     clock = source.scenario.network.activation
     has_rate = isinstance(clock, LinkClock) and hasattr(clock, "rate")

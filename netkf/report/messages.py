@@ -23,9 +23,7 @@ class ThinnedMessages(NamedTuple):
 
 
 def thin_messages(messages: np.ndarray, max_messages: int, instant: float) -> ThinnedMessages:
-    """Return about ``max_messages`` MESSAGE rows: half of them all around ``instant`` (s), the
-    other half spread over the run.
-    """
+    """Return about ``max_messages`` MESSAGE rows: half around ``instant`` (s), half of the run."""
     if len(messages) <= max_messages:
         return ThinnedMessages(messages, -np.inf, np.inf, 1)
     sent = np.sort(messages["sent"])

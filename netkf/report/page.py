@@ -27,13 +27,7 @@ from netkf.report.directories import ReportSource, read_source
 from netkf.report.filter_figure import filters_figure
 from netkf.report.innovations import read_innovations
 from netkf.report.markup import bullets, content_hash, paragraph, script_json, section, text
-from netkf.report.mending import (
-    central_sample,
-    describe_central,
-    describe_mending,
-    explain_worst,
-    mending_section,
-)
+from netkf.report.mending import describe_central, describe_mending, explain_worst, mending_section
 from netkf.report.outcome_figure import outcome_figures
 from netkf.report.packing import Packer
 from netkf.runs.documents import FINAL_STATUSES, DamagedError
@@ -233,16 +227,9 @@ def _assemble_page(
     script = _script()
     style = f"{_asset('uPlot.min.css')}\n{_asset('page.css')}{_series_css()}"
     policy = POLICY.format(script=content_hash(script), style=content_hash(style))
-    return _asset("page.html").format(
-        policy=text(policy),
-        title=text(title),
-        version=text(__version__),
-        style=style,
-        body=body,
-        data=script_json(data),
-        packed=packed,
-        script=script,
-    )
+    escaped = {"policy": text(policy), "title": text(title), "version": text(__version__)}
+    parts = {"style": style, "body": body, "packed": packed, "script": script}
+    return _asset("page.html").format(**escaped, **parts, data=script_json(data))
 
 
 def _live_data(entry: _AnalysedSource, limits: Budget, packer: Packer) -> dict[str, Any]:
@@ -287,9 +274,9 @@ def _source_sentences(entry: _AnalysedSource) -> list[str]:
         after_why = (k for k, line in enumerate(sentences, 1) if line.startswith("Why: "))
         index = next(after_why, len(sentences))
         sentences.insert(index, describe_mending(entry.worst))
-        central = central_sample(entry.source)
+        central = describe_central(entry.source, entry.worst)
         if central is not None:
-            sentences.insert(index + 1, describe_central(entry.source, entry.worst, central))
+            sentences.insert(index + 1, central)
     return sentences
 
 

@@ -1,6 +1,4 @@
-"""Tables of a page as HTML (verdicts, summaries, comparisons, sweeps, versions), and the data of
-curves that show the same numbers.
-"""
+"""Tables of a page as HTML, and the data of curves that show the same numbers."""
 
 from __future__ import annotations
 

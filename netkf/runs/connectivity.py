@@ -21,9 +21,7 @@ from netkf.trace.recorder import Sink
 from netkf.trace.schema import CODES, join_rows, rows_of
 
 RECENT = 5.0
-"""Where messages are recorded a link is up while the newest one heard is no older than so many mean
-intervals between messages.
-"""
+"""Mean intervals between messages for which a link is up after one was heard, by messages."""
 MAX_AT_ONCE = 1 << 24
 """Links times samples that are looked at together."""
 MAX_FULL = 64

@@ -98,9 +98,7 @@ def file_digests(directory: Path, names: Iterable[str]) -> dict[str, str]:
 
 
 def check_files(directory: Path, manifest: Mapping[str, Any], names: Iterable[str] = ()) -> None:
-    """Raise DamagedError unless those of ``names`` (default: all) that the ``manifest`` lists have
-    its digests.
-    """
+    """Raise DamagedError unless those of ``names`` that a ``manifest`` lists have its digests."""
     digests = manifest.get("files", {})
     require_form(digests, {}, "files")
     for name in names or digests:

@@ -141,9 +141,7 @@ def to_json_value(value: Any) -> Any:
 
 
 def create_output_directory(requested: Path | None, name: str, option: str = "--out") -> Path:
-    """Return a directory for results: ``requested`` by an option, if empty (ScenarioError), or
-    runs/NAME-k.
-    """
+    """Return a directory for results: ``requested``, if empty (ScenarioError), or runs/NAME-k."""
     if requested is None:
         safe = "".join(c if c.isalnum() or c in "-_." else "-" for c in name)[:100].strip(".")
         paths = (Path("runs") / f"{safe or 'run'}-{k}" for k in range(1, 1_000_000))
@@ -224,9 +222,7 @@ def copied_file_names(scenario: Scenario) -> list[str]:
 
 
 def other_files(directory: Path, names: Collection[str]) -> list[str]:
-    """Return what a directory holds beside ``names``, files and whole folders, and their temporary
-    files, by name.
-    """
+    """Return files and folders in a directory beside ``names`` and their temporary files."""
     allowed = {*names, *(f"{name}.part" for name in names)}
     allowed |= {str(folder) for name in names for folder in Path(name).parents}
     present = (path.relative_to(directory) for path in directory.rglob("*"))
@@ -268,9 +264,7 @@ def check_sources(scenario: Scenario) -> None:
 def write_scenario(
     directory: Path, scenario: Scenario, seed: int | None = None, resolve: bool = True
 ) -> None:
-    """Write scenario.toml, ``resolve`` with all defaults and with ``seed``, and copy its files and
-    modules. Raises WriteError.
-    """
+    """Write scenario.toml, with all defaults if ``resolve``, its files and modules (WriteError)."""
     for source in source_files(scenario):
         copy_file(source.full, directory / source.name)
     for module in find_module_files(scenario).values():
@@ -292,9 +286,7 @@ def copy_file(source: Path, target: Path) -> None:
 
 
 def scenario_digest(scenario: Scenario, **changed: Any) -> str:
-    """Return the SHA-256 of a scenario with all defaults, of which some are ``changed``, and its
-    files, to know own results.
-    """
+    """Return the SHA-256 of a scenario with all defaults, or ``changed`` keys, and its files."""
     digest = hashlib.sha256(to_toml(resolve_defaults(scenario) | changed).encode())
     files = {source.name: source.full for source in source_files(scenario)}
     files |= {f"{name}.py": file for name, file in find_module_files(scenario).items() if file}

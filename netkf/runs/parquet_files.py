@@ -33,9 +33,7 @@ EVENT_ENCODING = {
     "column_encoding": dict.fromkeys(("seq", "message"), "DELTA_BINARY_PACKED"),
 }
 STATE_ENCODING = {"use_dictionary": ["run", "t", "node"]}
-"""Options of pyarrow. Dictionaries only for columns whose values repeat take half the size and half
-the time of dictionaries for all.
-"""
+"""Options of pyarrow: dictionaries only where values repeat take half the size and time."""
 
 
 def read_numbers(

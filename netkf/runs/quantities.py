@@ -144,9 +144,7 @@ class NetworkSink(Sink):
         self.connectivity.states(t, x, xhat, P, error)
 
     def values(self, complete: bool) -> FloatArray:
-        """Return NETWORK (N + 1, 6) of nodes and of all, nan if missing; unless ``complete`` a run
-        ends with its last event.
-        """
+        """Return NETWORK (N + 1, 6), nan if missing; an incomplete run ends with its last event."""
         scenario = self._scenario
         found = traffic(scenario, self._transmissions)
         if self._ages is not None:

@@ -157,9 +157,7 @@ def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
 
 @dataclass(frozen=True, eq=False)
 class _Output:
-    """A run directory with its sinks; ``links`` is empty unless losses or delays are recorded,
-    ``network`` if nobody wants it.
-    """
+    """A run directory with its sinks; ``links`` and ``network`` are empty where not wanted."""
 
     directory: Path
     scenario: Scenario

@@ -183,9 +183,8 @@ def summarise(
     messages: dict[str, int],
     network: FloatArray | None = None,
 ) -> dict[str, Any]:
-    """Return the summary of a run, as in summary.json: averages over time of nodes and of all,
-    quantities of samples and of the ``network`` (N + 1, 6), and numbers of ``messages``, nan if
-    unknown.
+    """Return the summary of a run, as in summary.json: averages over time and quantities of nodes
+    and of all, those of the ``network`` (N + 1, 6), and numbers of ``messages``.
     """
     rows = _average_rows(scenario, sink, promised)
     if network is not None:
@@ -247,10 +246,7 @@ def _average_rows(
 
 
 def node_rows(
-    scenario: Scenario,
-    mean: FloatArray,
-    bound: FloatArray | None,
-    error: FloatArray | None = None,
+    scenario: Scenario, mean: FloatArray, bound: FloatArray | None, error: FloatArray | None = None
 ) -> list[dict[str, Any]]:
     """Return N + 1 rows of summary.json, of nodes and of all: ``mean`` (N + 1, 3) of square error,
     trace of P and NEES, standard errors ``error``, and the mean ``bound`` (N + 1,), if any.
@@ -305,9 +301,7 @@ def _clipping_notes(scenario: Scenario, clipped: int) -> list[str]:
 
 
 def conserved_sums(sums: dict[str, tuple[float, float]]) -> dict[str, Any]:
-    """Return the entry of summary.json on conserved sums, from (exact, last) by name, with the
-    relative deviation ``drift``.
-    """
+    """Return the entry of summary.json on conserved sums, from (exact, last) by name."""
     return {
         name: {"exact": exact, "total": total, "drift": (total - exact) / exact}
         for name, (exact, total) in sums.items()

@@ -215,13 +215,6 @@ def _check_speed(scenario: DerivedScenario) -> None:
         raise ScenarioError("plant.A", rule, A, "shorten the horizon")
 
 
-def _pauses_increments(scenario: DerivedScenario) -> bool:
-    """Return True if nodes of the filter can go without the increments of their sensors."""
-    algorithm = scenario.node_filter
-    kernels = compiled_kernels(algorithm, clocked=True)
-    return (kernels is None or kernels.is_kalman) and not algorithm.timing.pooled
-
-
 def _check_owners(name: str, entries: Sequence[Any]) -> None:
     """Raise ScenarioError unless nodes are in one each of ``entries``."""
     owners: dict[int, int] = {}
@@ -237,7 +230,10 @@ def _check_owners(name: str, entries: Sequence[Any]) -> None:
 def _check_lives(scenario: DerivedScenario) -> None:
     lives = scenario.network.lives
     _check_owners("lives", lives)
-    for k, life in enumerate(() if _pauses_increments(scenario) else lives):
+    clocked = compiled_kernels(scenario.node_filter, clocked=True)
+    # Whether nodes of the filter can go without the increments of their sensors.
+    can_pause = (clocked is None or clocked.is_kalman) and not scenario.node_filter.timing.pooled
+    for k, life in enumerate(() if can_pause else lives):
         for node in life.nodes:
             if node in scenario.increment_sensors:
                 rule = "cannot have a node whose sensors give increments, only one where they "
@@ -516,9 +512,8 @@ def _check_slots(scenario: DerivedScenario) -> None:
     activation = scenario.network.activation
     if not node_filter.timing.talks:
         return
-    is_matching = isinstance(activation, Matching) or (
-        isinstance(activation, RecordedSlots) and activation.matching
-    )
+    recorded = activation if isinstance(activation, RecordedSlots) else None
+    is_matching = isinstance(activation, Matching) or (recorded is not None and recorded.matching)
     if is_matching != node_filter.timing.pairwise:
         assert activation is not None
         form = "matching" if node_filter.timing.pairwise else "broadcast"

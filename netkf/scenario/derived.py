@@ -1,6 +1,4 @@
-"""Values that engines and theory compute from the fields of a scenario: models, weights, true
-states, message rates.
-"""
+"""Values that engines and theory compute from the fields of a scenario."""
 
 from __future__ import annotations
 
@@ -185,21 +183,14 @@ class DerivedScenario(ScenarioModel):
         first = (self._pooled_model,) if pooled else self._node_models
         pieces: list[tuple[Any, ...]] = [first]
         for matrices in self.believed_pieces[1:]:
-            if self.model_views is not None and not pooled:
-                pieces.append(
-                    tuple(
-                        dataclasses.replace(
-                            model,
-                            **{
-                                name: M[view][:, view]
-                                for name, M in zip(names, matrices, strict=True)
-                            },
-                        )
-                        for model, view in zip(first, self.model_views, strict=True)
-                    )
-                )
-                continue
             changed = dict(zip(names, matrices, strict=True))
+            if self.model_views is not None and not pooled:
+                views = zip(first, self.model_views, strict=True)
+                parts = (
+                    (m, {n: M[view][:, view] for n, M in changed.items()}) for m, view in views
+                )
+                pieces.append(tuple(dataclasses.replace(model, **part) for model, part in parts))
+                continue
             # Equal models stay one object.
             models = {id(model): dataclasses.replace(model, **changed) for model in first}
             pieces.append(tuple(models[id(model)] for model in first))
@@ -281,7 +272,9 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def _pooled_model(self) -> Any:
-        stacked = self._stack_sensors(self._pooled_sensors, believed=True)
+        sensors_of_nodes = self.placed_sensors if self.slotted else self.increment_sensors
+        placed = tuple(itertools.chain.from_iterable(sensors_of_nodes.values()))
+        stacked = self._stack_sensors(placed, believed=True)
         return self._slot_model(*stacked) if self.slotted else self._flow_model(*stacked)
 
     @cached_property
@@ -296,9 +289,7 @@ class DerivedScenario(ScenarioModel):
         return tuple(np.append(view, np.setdiff1d(whole, view)) for view in views)
 
     def model_view(self, k: int) -> Any:
-        """Return the entries (n,) of the state of which filter number ``k`` has a model, or a
-        slice.
-        """
+        """Return the entries (n,) of which filter number ``k`` has a model, or a slice."""
         views = None if self.node_filter.timing.pooled else self.model_views
         return slice(None) if views is None else views[k]
 
@@ -604,9 +595,7 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def surprise(self) -> Response | None:
-        """The response to the input that is left in the coordinates of filters; None if it is 0, or
-        the plant is not linear.
-        """
+        """The response to the input that filters do not follow; None if it is 0, or not linear."""
         if self.plant.input is None or not self.plant.linear:
             return None
         pieces: Any = self.plant.pieces[: 1 + int((self.plant.changes < self.horizon).sum())]
@@ -818,11 +807,6 @@ class DerivedScenario(ScenarioModel):
         return all(np.array_equal(believed, true) for believed, true in pairs)
 
     @property
-    def _pooled_sensors(self) -> tuple[PlacedSensor, ...]:
-        sensors_of_nodes = self.placed_sensors if self.slotted else self.increment_sensors
-        return tuple(itertools.chain.from_iterable(sensors_of_nodes.values()))
-
-    @property
     def _believed_Q(self) -> FloatArray:
         """The covariance (n, n) of the noise of a nonlinear plant that filters believe."""
         plant, model = self.plant, self.filter.model
@@ -854,9 +838,7 @@ class DerivedScenario(ScenarioModel):
         return FlowModel(A, Q, H, R, self.horizon, min(period, self.horizon))
 
     def initial_estimate(self, node: int) -> tuple[FloatArray, FloatArray]:
-        """Return ``xhat`` (n,) and ``P`` (n, n) of a node at time 0: of ``filter.mean`` and
-        ``filter.cov``, or of x(0).
-        """
+        """Return ``xhat`` (n,) and ``P`` (n, n) of a node at time 0, by default those of x(0)."""
         index, mean, cov = self.topology.index[node], self.filter.mean, self.filter.cov
         if mean is None:
             mean = self.plant.start_mean

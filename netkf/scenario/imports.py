@@ -59,8 +59,10 @@ def find_class(kind: str, origin: Origin) -> Any:
     elif module_name not in {*sys.modules, PARTS}:
         # The modules of all classes for scenarios are loaded; no other code may be run.
         raise _import_error(kind, ModuleNotFoundError(f"No module named {module_name!r}"))
-    if not origin.imports and not is_loaded(module_name, class_name, origin.folder):
-        return None
+    if not origin.imports:
+        module = sys.modules.get(module_name)
+        if not hasattr(module, class_name) or _is_namesake(module, module_name, origin.folder):
+            return None
     folders = (str(origin.folder), str(Path.cwd()))
     path = [*(folder for folder in folders if folder not in sys.path), *sys.path]
 
@@ -154,12 +156,6 @@ def _import_error(kind: str, error: BaseException, target: str = "") -> Scenario
         place = error_line(error, module.partition(".")[0]) or module
         remedy = f"correct the module, {place}" if place else "correct the module"
     return ScenarioError("kind", rule, kind, remedy)
-
-
-def is_loaded(module_name: str, class_name: str, folder: Path) -> bool:
-    """Return True if a class is loaded, and ``folder`` has no module of that name."""
-    module = sys.modules.get(module_name)
-    return hasattr(module, class_name) and not _is_namesake(module, module_name, folder)
 
 
 def unload_namesake(module_name: str, folder: Path) -> None:

@@ -428,9 +428,7 @@ class ScenarioModel(Component):
             yield of_row.pop() if is_plain else ""
 
     def label_of_value(self, node: int, number: int, sizes: np.ndarray | None) -> str:
-        """Return the label of value ``number`` of readings of ``sizes`` (M,), or of all that the
-        node reads; empty if it is unknown.
-        """
+        """Return the label of value ``number`` of readings of ``sizes`` (M,), or of all; or ""."""
         labels = self.labels_of_readings(node)
         is_whole = sizes is None or bool((sizes == len(labels)).all())
         return labels[number] if is_whole else labels[0] if len(set(labels)) == 1 else ""
@@ -629,9 +627,7 @@ class ScenarioModel(Component):
 
     @property
     def end_time(self) -> float:
-        """The end of simulation (s): the horizon, or a period later if the last slot is sampled
-        after its exchanges.
-        """
+        """The end of simulation (s): the horizon, or the end of a slot sampled after exchanges."""
         if not self.slotted or self.node_filter.timing.predicts:
             return self.horizon
         return self.horizon + self.slot_plant.period

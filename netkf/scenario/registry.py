@@ -130,11 +130,7 @@ KINDS: dict[str, dict[str, type[Component]]] = {
         "contacts": contacts.Contacts,
         "readings": clocks.OnReadings,
     },
-    "life": {
-        "crashes": lives.Crashes,
-        "duty": lives.DutyCycle,
-        "recorded": lives.RecordedLife,
-    },
+    "life": {"crashes": lives.Crashes, "duty": lives.DutyCycle, "recorded": lives.RecordedLife},
     "loss": {
         "none": losses.NoLoss,
         "bernoulli": losses.Bernoulli,
@@ -177,14 +173,6 @@ SLOTTED = (SlotPlant,)
 """Base classes of plants in slots."""
 
 
-def explain_kind_mismatch(family: str, kind: object) -> str | None:
-    """Return the reason if a kind exists for the other model of time only, else None."""
-    other = family.removeprefix("slot ") if family.startswith("slot ") else f"slot {family}"
-    if not isinstance(kind, str) or kind not in KINDS.get(other, {}) or kind in KINDS[family]:
-        return None
-    return explain_time_mismatch(slotted=family.startswith("slot "))
-
-
 def explain_time_mismatch(slotted: bool) -> str:
     """Return the rule that a component breaks which does not fit the plant's time."""
     slots, flow = "in slots (linear)", "in continuous time (diffusion)"
@@ -223,9 +211,11 @@ def find_kind(
         return KINDS[family][_choose_name(choices, table)]
     if isinstance(kind, str) and ":" in kind:
         return _require_part(family, kind, find_class(kind, origin))
-    reason = explain_kind_mismatch(family, kind)
-    if reason is not None:
-        raise ScenarioError("kind", reason, kind, "change the plant or choose another kind")
+    slotted = family.startswith("slot ")
+    other = family.removeprefix("slot ") if slotted else f"slot {family}"
+    if isinstance(kind, str) and kind in {*KINDS.get(other, {})} - {*KINDS[family]}:
+        rule, remedy = explain_time_mismatch(slotted), "change the plant or choose another kind"
+        raise ScenarioError("kind", rule, kind, remedy)
     kinds, offered = list_kinds(family), offered_kinds()
     if isinstance(kind, str) and kind in offered:
         return _require_part(family, kind, find_offered_class(kind, origin))

@@ -135,9 +135,7 @@ def require_states(
 
 
 def check_sampling(scenario: ScenarioModel) -> None:
-    """Raise ScenarioError if the sampling of a sensor does not fit plant or graph; recorded states
-    must have those that replica 0 needs.
-    """
+    """Raise ScenarioError if sampling does not fit plant or graph, or recorded states miss."""
     for k, sensor in enumerate(scenario.sensors):
         key = scenario.sensor_key(k)
         if isinstance(sensor, (LinearSensor, NonlinearSensor)):

@@ -81,9 +81,7 @@ FAMILIES = {
     for name in KINDS
     if " " not in name
 }
-"""The families of registry.KINDS that a table can belong to, by the table's name in ``$defs``; all
-filters are of the family "filter".
-"""
+"""The families of registry.KINDS that a table can belong to, by its name in ``$defs``."""
 
 
 class TableKey(NamedTuple):
@@ -266,9 +264,7 @@ def summary(cls: type) -> str:
 
 
 def describe_field(docstring: str, name: str) -> str:
-    """Return the entry ``name  description`` of a docstring on one line, or else all sentences with
-    the name in backquotes.
-    """
+    """Return the entry ``name  description`` of a docstring, or all sentences with `name`."""
     entry = re.search(rf"^{re.escape(name)}  +(.+(?:\n +.*)*)", docstring, flags=re.MULTILINE)
     if entry:
         line = " ".join(entry.group(1).split())

@@ -118,9 +118,7 @@ def restamp(part: Any, stamps: TimeBase) -> Any:
 
 
 def stamp_notes(scenario: Any) -> tuple[str, ...]:
-    """Return a line if every record begins long after 0, by horizon and own length, or an origin
-    leaves none in the run.
-    """
+    """Return a line if all records begin long after 0, or [time] origin leaves none in the run."""
     times = [t for t in _recorded_times(scenario) if t.size]
     if not times:
         return ()

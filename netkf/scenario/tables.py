@@ -305,11 +305,7 @@ def _find_dynamics(origin: Origin, value: Any) -> Any:
 
 
 def _build_component(
-    family: str,
-    origin: Origin,
-    value: Any,
-    default_kind: str | None = None,
-    is_inner: bool = False,
+    family: str, origin: Origin, value: Any, default_kind: str | None = None, is_inner: bool = False
 ) -> Any:
     table = _as_dict(value)
     kind = table.pop("kind", default_kind)

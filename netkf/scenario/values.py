@@ -29,9 +29,7 @@ def split_setting(option: str, setting: str) -> tuple[str, str]:
 
 
 def parse_value(option: str, key: str, text: str) -> Any:
-    """Return the value of a TOML expression, a number such as ``.5``, or words without quotes;
-    raises ScenarioError at ``option``.
-    """
+    """Return the value of TOML, a number as ``.5``, or words without quotes (ScenarioError)."""
     try:
         return _parse_toml_value(text)
     except (ValueError, RecursionError):

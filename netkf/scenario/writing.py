@@ -32,9 +32,7 @@ from netkf.scenario.registry import FAMILIES, name_of
 
 
 class _Style(NamedTuple):
-    """How tables are written: with keys at their defaults or without, and with ``names`` of nodes,
-    by id.
-    """
+    """How tables are written: with keys at their defaults, and with ``names`` of nodes by id."""
 
     with_defaults: bool = False
     names: Mapping[int, str] = MappingProxyType({})
@@ -72,11 +70,7 @@ def resolve_defaults(scenario: DerivedScenario) -> dict[str, Any]:
 
 
 def _scenario_table(
-    scenario: DerivedScenario,
-    plant: Plant,
-    network: Network,
-    filtering: Filtering,
-    style: _Style,
+    scenario: DerivedScenario, plant: Plant, network: Network, filtering: Filtering, style: _Style
 ) -> dict[str, Any]:
     table = _field_values(scenario, style)
     table.pop("time", None)

@@ -168,8 +168,7 @@ class RunDirectory:
 
     def by_run(self, quantity: str, node: int, end: float) -> pd.Series[float] | None:
         """Return averages over time by run of a ``quantity`` (of ``rms_error`` the square) at
-        ``node``, -1 for all together; of errors and NEES only samples before ``end`` (s). None
-        without states.
+        ``node``, -1 for all; of errors and NEES before ``end`` (s). None without states.
         """
         columns = {"rms_error": "sq_error", "mean_trace": "mean_trace", "mean_nees": "nees"}
         if self.samples is None or quantity not in columns:

@@ -105,11 +105,7 @@ class Quantity(NamedTuple):
 
 
 def estimate_quantities(
-    values: FilterValues,
-    first: FilterValues | None,
-    n: float,
-    names: Sequence[str],
-    level: float,
+    values: FilterValues, first: FilterValues | None, n: float, names: Sequence[str], level: float
 ) -> dict[str, Quantity]:
     """Return ``rms_error``, ``nees_ratio`` and the quantities of samples, ``names``, of a filter of
     n states, with paired differences from the ``first``; intervals of JUDGED miss with ``level``.

@@ -325,9 +325,7 @@ class NoiseFit(NotebookTable):
 
     @cached_property
     def scenario(self) -> Scenario:
-        """The scenario with the changes; raises ScenarioError if its filter does not take them, of
-        which there is a note then.
-        """
+        """The scenario with the changes; raises ScenarioError if its filter does not take them."""
         return self.given.replace(self.changes)
 
     def __repr__(self) -> str:

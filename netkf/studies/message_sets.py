@@ -18,9 +18,7 @@ from netkf.network.deliveries import MessageKey
 from netkf.studies.replay import Replayer
 
 NEGLIGIBLE = 1e-2
-"""The oldest messages are left out if all of them together change the trace by less than this share
-of its distance from the limit.
-"""
+"""Share of the distance from the limit below which the oldest messages are left out."""
 COARSENESS = 16
 """At most one of so many candidates stays though it and all older ones are negligible together."""
 MAX_SETS = 300_000
@@ -73,11 +71,7 @@ class SmallestSet:
 
 
 def find_smallest_set(
-    replayer: Replayer,
-    candidates: Sequence[Candidate],
-    limit: float,
-    most: int,
-    replays: int,
+    replayer: Replayer, candidates: Sequence[Candidate], limit: float, most: int, replays: int
 ) -> SmallestSet:
     """Return the smallest set (up to ``most``) that brings trace P to ``limit``, by replays."""
     search = _Search(replayer, limit)

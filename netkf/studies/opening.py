@@ -1,6 +1,4 @@
-"""``netkf.open``: read a run, an ensemble, a sweep, a comparison of filters or a verdict back from
-its directory.
-"""
+"""``netkf.open``: read what a command wrote back from its directory."""
 
 from __future__ import annotations
 

@@ -44,13 +44,9 @@ DIGITS = {"theory": 4, "simulation": 2, "both": 2}
 EXACT, BOUND, SIMULATION = "exact", "bound", "simulation"
 """How a value was decided."""
 MAX_EXTRAPOLATION, MARGIN = 100.0, 1.5
-"""Largest factor beyond the range for which a next range is advised, and safety factor on the
-logarithm of the extrapolated one.
-"""
+"""Largest factor beyond the range that is advised, and safety factor on its logarithm."""
 MAX_RUNS, FUTILE = 1e7, 10.0
-"""Largest number of runs that is advised; a value that needs FUTILE times the given runs is given
-up early.
-"""
+"""Most runs that are advised; a value that needs FUTILE times the given ones is given up."""
 
 
 class Probe(NamedTuple):
