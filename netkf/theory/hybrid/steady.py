@@ -12,6 +12,7 @@ than the time in which H(12) grows, and P exceeds every bound.
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import Any
 
@@ -38,10 +39,8 @@ MAX_FACTOR = 1e6  # largest factor on the link rates that the search for the thr
 NEWTON_TOLERANCE = 1e-7  # of a change of P, relative to the slope that it has to undo
 POWER_STEPS = 60  # of the power method, each of which gives a valid bound
 IMPLICIT_STEPS = 3  # of Newton's method for an implicit step of H(12)
-NEWTON_STEPS = 12  # convergence is quadratic: more would not help
 MAX_FACTORED = 3000  # nodes of a network without small cuts up to which its coupling is factored
 MAX_LISTED = 12  # nodes that a message names
-MAX_GUESSES = 8  # of the threshold in a row, before the interval is halved
 FEW_UNKNOWNS = 400  # up to which the threshold is found to 1e-6
 
 
@@ -216,68 +215,28 @@ def _no_steady_state(scenario: Scenario, equations: CoupledRiccati) -> str:
 
 def threshold_factor(equations: CoupledRiccati) -> float | None:
     """Return the least factor on link rates with a steady state of H(12); None above 1e6."""
+
+    def stabilised(factor: float, first: FloatArray | None) -> FloatArray | None:
+        return _find_stabilising(PackedRiccati(equations.scale_rates(factor)), first)
+
     low = _necessary_factor(equations)
     if low is None:
         return None
     low, high = max(1.0, low), max(2.0, 2.5 * low)
-    while (P := _steady_at(equations, high, None)) is None:
+    while (P := stabilised(high, None)) is None:
         low, high = high, 4.0 * high
         if high > MAX_FACTOR:
             return None
     fine = 1e-6 if equations.start.size <= FEW_UNKNOWNS else 1e-3
-    # Points (factor, 1 / max P), from which guesses extrapolate to 1 / max P = 0.
-    points, guesses = [(high, 1.0 / float(np.abs(P).max()))], 0
     while high / low > 1.0 + fine:
-        # Guesses approach from above, where the last P is a good start; a factor below the
-        # threshold takes several times as long.
-        if len(points) == 1:
-            factor = low**0.2 * high**0.8
-        elif guesses < MAX_GUESSES:
-            factor, guesses = _guess(points, low, high, fine), guesses + 1
-        else:
-            factor, guesses = float(np.sqrt(low * high)), 0
+        factor = math.sqrt(low * high)
         # Covariances grow as links get slower; gains that are too large still stabilise.
-        following = _steady_at(equations, factor, 4.0 * P)
+        following = stabilised(factor, 4.0 * P)
         if following is None:
             low = factor
         else:
             high, P = factor, following
-            points.append((high, 1.0 / float(np.abs(P).max())))
     return high
-
-
-def _steady_at(
-    equations: CoupledRiccati, factor: float, first: FloatArray | None
-) -> FloatArray | None:
-    """Return the steady state (N, n, n) with link rates times ``factor``, or None."""
-    packed = PackedRiccati(equations.scale_rates(factor))
-    P = _find_stabilising(packed, first)
-    if P is None:
-        return None
-    for _ in range(NEWTON_STEPS):
-        previous, P = P, _newton(packed, P)
-        if np.abs(P - previous).max() <= 1e-4 * np.abs(P).max():
-            break
-    return P
-
-
-def _guess(points: list[tuple[float, float]], low: float, high: float, fine: float) -> float:
-    """Return a factor near the threshold, extrapolated from ``points`` (factor, 1 / max P)."""
-    # 1 / max P falls to 0 at the threshold like a power of the distance from it: the first or, as
-    # covariances that sensors see grow like roots of the others, more. The power that puts three
-    # points on one line extrapolates them to ``root``.
-    factors, inverses = np.array(points[-3:]).T
-    powers = np.linspace(0.1, 1.0, 91) if len(factors) > 2 else np.ones(1)
-    heights = inverses[:, None] ** powers
-    slopes = np.diff(heights, axis=0) / np.diff(factors)[:, None]
-    best = int(np.argmin(np.abs(slopes[0] / slopes[-1] - 1.0)))
-    root = float(factors[-1] - heights[-1, best] / slopes[-1, best])
-    above = root * (1.0 + 0.4 * fine)
-    # First try a factor just above ``root``, to lower ``high``. Once ``high`` is about that close,
-    # try one as far below ``root`` as ``high`` is above it, to raise ``low``. As ``above`` exceeds
-    # ``root`` by less than fine / 2, both ends together then meet the accuracy.
-    factor = above if above < 0.5 * (root + high) else 2.0 * root - high
-    return factor if low < factor < high else float(np.sqrt(low * high))
 
 
 def _necessary_factor(equations: CoupledRiccati) -> float | None:
