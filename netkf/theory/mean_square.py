@@ -1,4 +1,4 @@
-"""Exact steady mean squares of errors over random losses and clocks.
+"""Exact steady mean squares of errors over random losses, bursts and clocks.
 
 Where the gains of a filter do not depend on data or on what happens in the network, its errors are
 a linear system with jumps (theory/common/jumps.py), which the folder of the paper makes.
@@ -6,6 +6,7 @@ a linear system with jumps (theory/common/jumps.py), which the folder of the pap
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import lru_cache
 
@@ -27,6 +28,10 @@ from netkf.theory.numerics.positive_maps import fixed_point, spectral_radius
 
 MAX_ERRORS = 200
 """Largest number of errors of all nodes; a step then takes milliseconds, a solution seconds."""
+MAX_NUMBERS, QUICK_NUMBERS = 4_000_000, 40_000
+"""Largest number of entries of the second moments of all modes, and that up to which a solution
+takes a second.
+"""
 
 
 def mean_square_radius(scenario: Scenario) -> float:
@@ -47,10 +52,10 @@ def steady_error_covariance(scenario: Scenario) -> FloatArray:
 
     By one generalised Lyapunov equation, for filters whose gains are constant: ``constant-gain``,
     ``kcf`` in slots with its own readings or without losses, ``track-fusion`` by
-    cross-covariances, ``local`` and ``central`` in slots. Losses must be independent, delays none
-    or, in slots, fixed (a message that is late is lost), clocks Poisson; at most 200 errors of all
-    nodes together. Raises TheoryError with the reason where there is no such mean, or it is not
-    known.
+    cross-covariances, ``local`` and ``central`` in slots. Losses may be independent, by link or
+    bursty (Gilbert-Elliott, few links), delays none or, in slots, fixed (a message that is late is
+    lost), clocks Poisson; at most 200 errors of all nodes together. Raises TheoryError with the
+    reason where there is no such mean, or it is not known.
     """
     radius, covariance = _solve(scenario)
     if covariance is None:
@@ -70,16 +75,13 @@ def _solve(scenario: Scenario) -> tuple[float, FloatArray | None]:
         solved: tuple[float, FloatArray | None] = solve(scenario)
         return solved
     system = linear_errors(scenario)
-    if system.size > MAX_ERRORS:
-        raise TheoryError(
-            f"{system.size} errors of all nodes together; exact mean squares are computed for at "
-            f"most {MAX_ERRORS}"
-        )
+    _require_size(system.shape)
     T, Q = system.maps()
-    radius = spectral_radius(T, system.size) if Q is not None else np.inf
+    radius = spectral_radius(T, system.shape) if Q is not None else np.inf
     if Q is None or not contracts(radius):
         return float(radius), None
-    covariances = diagonal_blocks(fixed_point(T, Q, radius)[None], system.nodes)[0]
+    X = fixed_point(T, Q, radius).sum(axis=0)
+    covariances = diagonal_blocks(X[None], system.nodes)[0]
     # Nodes that share one filter share its error.
     return radius, np.repeat(covariances, len(scenario.nodes) // system.nodes, axis=0)
 
@@ -123,7 +125,9 @@ def has_linear_errors(scenario: Scenario) -> bool:
 
 def is_quickly_solved(scenario: Scenario) -> bool:
     """Return True if the mean squares of a scenario with constant gains take a second or so."""
-    return len(scenario.nodes) * scenario.plant.n <= MAX_ERRORS
+    if _choose_solver(scenario) is not None:
+        return len(scenario.nodes) * scenario.plant.n <= MAX_ERRORS
+    return math.prod(linear_errors(scenario).shape) <= QUICK_NUMBERS
 
 
 def _choose_solver(
@@ -141,6 +145,20 @@ def _system_maker(scenario: Scenario) -> Callable[[Scenario], LinearErrors] | No
     if compiled_kernels(node_filter, clocked=False) == Kernels() and not node_filter.timing.talks:
         return silent_jumps
     return paper.slot_jumps
+
+
+def _require_size(shape: tuple[int, int, int]) -> None:
+    S, M, _ = shape
+    if M > MAX_ERRORS:
+        raise TheoryError(
+            f"{M} errors of all nodes together; exact mean squares are computed for at most "
+            f"{MAX_ERRORS}"
+        )
+    if S * M * M > MAX_NUMBERS:
+        raise TheoryError(
+            f"{S} joint states of the links with {M} errors are {S * M * M:,} numbers; at most "
+            f"{MAX_NUMBERS:,} are computed"
+        )
 
 
 def silent_jumps(scenario: Scenario) -> SlotJumps:

@@ -33,6 +33,8 @@ CHANNELS = {
     "lossless": {},
     "losses": {**BERNOULLI, "symmetric": False},
     "losses of both": BERNOULLI,
+    "bursts": {"loss": BURSTS},
+    "bursts each way": {"loss": BURSTS, "symmetric": False},
     "late": {**BERNOULLI, "delay": {"kind": "constant", "seconds": 0.7}},
 }
 
@@ -44,18 +46,35 @@ def slots(algorithm, folder, channel, **more):
 
 
 def outcomes(scenario):
-    """All arrivals: (probability, ways that are up)."""
+    """All states of all chains and arrivals: (probability of a step, state, ways that are up)."""
     channel = scenario.network.channel
     links = [(0, 1), (1, 2)]
     ways = links if channel.symmetric else [way for i, j in links for way in ((i, j), (j, i))]
     late = (channel.delay.fixed or 0.0) > 0.5
-    p = [channel.loss.mean_delivery(Transmission(way)) for way in ways]
-    for up in itertools.product((0, 1), repeat=len(ways)):
+    bursts = type(channel.loss).__name__ == "GilbertElliott"
+
+    def both(up):
         heard = set()
         for way, arrives in zip(ways, up, strict=True):
             if arrives and not late:
                 heard |= {way, way[::-1]} if channel.symmetric else {way}
-        yield math.prod(q if u else 1.0 - q for q, u in zip(p, up, strict=True)), heard
+        return heard
+
+    states = list(itertools.product((0, 1), repeat=len(ways))) if bursts else [()]
+    for after in states:
+        p = (
+            [(0.9, 0.1)[bad] for bad in after]
+            if bursts
+            else [channel.loss.mean_delivery(Transmission(way)) for way in ways]
+        )
+        for up in itertools.product((0, 1), repeat=len(ways)):
+            chance = math.prod(q if u else 1.0 - q for q, u in zip(p, up, strict=True))
+            yield after, chance, both(up)
+
+
+def transition(before, after):
+    step = ((0.8, 0.2), (0.3, 0.7))
+    return math.prod(step[a][b] for a, b in zip(before, after, strict=True))
 
 
 def kalman_steady(F, Q, H, R):
@@ -97,16 +116,24 @@ def slot_matrices(paper, heard):
 
 
 def enumerated(scenario):
-    """The solution of vec X = sum p ((A (x) A) vec X + vec(G Q G' + K R K'))."""
+    """The solution of vec X_s' = sum p (A (x) A) vec X_s + p pi_s vec(G Q G' + K R K')."""
     Q, R = np.array(PLANT["Q"]), np.array(SENSOR["R"])
-    M = 6
-    whole, right = np.zeros((M * M, M * M)), np.zeros(M * M)
-    for chance, heard in outcomes(scenario):
+    found = list(outcomes(scenario))
+    states = sorted({after for after, _, _ in found})
+    S, M = len(states), 6
+    whole, right = np.zeros((S, M * M, S, M * M)), np.zeros((S, M * M))
+    stationary = [math.prod((0.6, 0.4)[bad] for bad in state) for state in states]
+    for after, chance, heard in found:
         A, G, K = slot_matrices(scenario.filter.algorithm.analysis.paper, frozenset(heard))
-        whole += chance * np.kron(A, A)
-        right += chance * (G @ Q @ G.T + K @ R @ K.T).ravel()
-    X = np.linalg.solve(np.eye(M * M) - whole, right).reshape(M, M)
-    radius = np.abs(np.linalg.eigvals(whole)).max()
+        double, added = np.kron(A, A), (G @ Q @ G.T + K @ R @ K.T).ravel()
+        for s, before in enumerate(states):
+            p = chance * transition(before, after)
+            whole[states.index(after), :, s] += p * double
+            right[states.index(after)] += p * stationary[s] * added
+    flat = whole.reshape(S * M * M, S * M * M)
+    X = np.linalg.solve(np.eye(len(flat)) - flat, right.ravel())
+    radius = np.abs(np.linalg.eigvals(flat)).max()
+    X = X.reshape(S, M, M).sum(axis=0)
     return [X[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(3)], radius
 
 
@@ -200,6 +227,29 @@ def test_the_threshold_of_a_blind_node(tmp_path):
         theory.steady_error_covariance(scalar(tmp_path, a, 0.98 * threshold))
 
 
+def test_bursts_of_one_link_under_a_clock(tmp_path):
+    """Four unknowns for each state: the generator written out."""
+    a, rate, w, L, R = -0.1, 1.5, 0.5, 1.3, 0.5
+    scenario = scalar(tmp_path, a, rate, loss=BURSTS)
+    B = np.array([[a - L, 0.0], [0.0, a]])
+    flow = np.kron(B, np.eye(2)) + np.kron(np.eye(2), B)
+    J = np.array([[1.0, 0.0], [w, 1.0 - w]])
+    jump, step, arrives = np.kron(J, J), ((0.8, 0.2), (0.3, 0.7)), (0.9, 0.1)
+    whole = np.zeros((2, 4, 2, 4))
+    for before in range(2):
+        whole[before, :, before] += flow - rate * np.eye(4)
+        for after in range(2):
+            p = arrives[after]
+            whole[after, :, before] += (
+                rate * step[before][after] * (p * jump + (1.0 - p) * np.eye(4))
+            )
+    noise = np.array([[1.0 + L * L * R, 1.0], [1.0, 1.0]]).ravel()
+    right = np.concatenate([0.6 * noise, 0.4 * noise])
+    X = np.linalg.solve(whole.reshape(8, 8), -right).reshape(2, 2, 2).sum(axis=0)
+    found = theory.steady_error_covariance(scenario)
+    np.testing.assert_allclose(found[:, 0, 0], np.diag(X), rtol=1e-10)
+
+
 NETWORK = {"kind": "edges", "edges": [[0, 1], [1, 2], [2, 3], [0, 2]]}
 
 
@@ -259,11 +309,13 @@ def test_what_has_no_constant_gains_is_refused_with_the_reason(tmp_path):
         "sensors": [{**SENSOR, "sampling": periodic}],
     }
     apart = {"graph": PATH, "activation": {**periodic, "at": "nodes"}}
+    bursts = {"graph": {"kind": "complete", "nodes": 6}, "activation": {"kind": "broadcast"}}
+    bursts |= {"channel": {"loss": BURSTS}}
     late = {"kind": "constant", "seconds": 0.1}
     cases = [
         (slots({"kind": "hcmci"}, tmp_path, {}), "whose gains follow what happens"),
         (scenario_of(CONSTANT, tmp_path, **clocked), "does not sample by a Poisson clock"),
-        (slots(CONSTANT, tmp_path, {"loss": BURSTS}), "losses depend on earlier ones"),
+        (slots(CONSTANT, tmp_path, {}, network=bursts), "2^15 joint states"),
         (
             slots({**CONSTANT, "model": {"F": [[0.9, 0.0], [0.0, 0.9]]}}, tmp_path, {}),
             "the filters' plant is not the true one",

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,16 +27,22 @@ from netkf.network.matchings import Broadcast, RecordedSlots
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import lacks_channel_law, no_channel_law
 
+MAX_CHAINS = 10
+"""Independent chains of bursty links whose joint states are enumerated."""
+
 
 class Directions(NamedTuple):
-    """K directed links.
+    """K directed links and S joint states (modes) of their channels.
 
     sender, receiver : (K,) indices of nodes
     weight           : (K, n, n) the matrices W_k
-    source           : (K,) index of the draw that decides on delivery, the same for directions that
-                       fail together
-    delivery         : (K,) probability that a message arrives
+    source           : (K,) index of the draw (and of the Gilbert-Elliott chain) that decides on
+                       delivery; directions that fail together have the same source
+    delivery         : (S, K) probability that a message arrives, by mode
     share            : probability that all hearers of a broadcast have one fate
+    steps            : transition probabilities (to_bad, to_good) of each chain, which makes a step
+                       at each activation; None if there is one mode only. Bit c of the index of a
+                       mode is 1 if chain c is in its bad state
     """
 
     sender: IntArray
@@ -45,38 +51,79 @@ class Directions(NamedTuple):
     source: IntArray
     delivery: FloatArray
     share: float
+    steps: tuple[float, float] | None
+
+    @property
+    def modes(self) -> int:
+        """S, the number of modes."""
+        return len(self.delivery)
+
+    @property
+    def stationary(self) -> FloatArray:
+        """The probabilities (S,) of the modes in the long run."""
+        if self.steps is None:
+            return np.ones(1)
+        to_bad, to_good = self.steps
+        bad = to_bad / (to_bad + to_good)
+        probabilities = np.ones(1)
+        for _ in range(int(np.log2(self.modes))):
+            probabilities = np.concatenate([probabilities * (1.0 - bad), probabilities * bad])
+        return probabilities
+
+    def advance(self, X: FloatArray, chains: IntArray) -> FloatArray:
+        """Return second moments (S, M, M) by mode after a step of the bursty ``chains``."""
+        if self.steps is None:
+            return X
+        to_bad, to_good = self.steps
+        transition = np.array([[1.0 - to_bad, to_bad], [to_good, 1.0 - to_good]])
+        for chain in chains.tolist():
+            # Modes as (higher chains, this one, lower chains).
+            split = X.reshape(-1, 2, 1 << chain, *X.shape[1:])
+            X = np.einsum("st,asbij->atbij", transition, split).reshape(X.shape)
+        return X
+
+    def stay(self, chains: IntArray) -> FloatArray:
+        """Return the probability (S,), by mode, that a step of ``chains`` leaves the mode."""
+        if self.steps is None:
+            return np.ones(1)
+        to_bad, to_good = self.steps
+        modes, probability = np.arange(self.modes), np.ones(self.modes)
+        for chain in chains.tolist():
+            probability *= np.where(modes >> chain & 1, 1.0 - to_good, 1.0 - to_bad)
+        return probability
 
     def mean(self, nodes: int, directions: IntArray) -> FloatArray:
-        """Return E[D] (N n, N n) of one exchange over the given ``directions``."""
+        """Return E[D] (S, N n, N n), by mode, of one exchange over the given ``directions``."""
         n = self.weight.shape[-1]
-        blocks = np.zeros((nodes, nodes, n, n))
-        terms = self.delivery[directions, None, None] * self.weight[directions]
+        blocks = np.zeros((self.modes, nodes, nodes, n, n))
+        terms = self.delivery[:, directions, None, None] * self.weight[directions]
         receiver, sender = self.receiver[directions], self.sender[directions]
-        np.add.at(blocks, (receiver, sender), terms)
-        np.add.at(blocks, (receiver, receiver), -terms)
+        _add_blocks(blocks, receiver, sender, terms)
+        _add_blocks(blocks, receiver, receiver, -terms)
         return _join_blocks(blocks)
 
     def products(
         self, first: IntArray, second: IntArray, factor: FloatArray, Z: FloatArray
     ) -> FloatArray:
         """Return ``sum_p c_p D_a Z D_b'`` over pairs of directions ``first``, ``second`` (P,), D_a
-        the change by a message on a; ``factor`` (P,) is c, Z (N n, N n).
+        the change by a message on a; ``factor`` (S, P) is c by mode, Z (S, N n, N n).
         """
         n = self.weight.shape[-1]
-        N = len(Z) // n
-        blocks = np.swapaxes(Z.reshape(N, n, N, n), 1, 2)
+        S, N = len(Z), Z.shape[1] // n
+        blocks = np.swapaxes(Z.reshape(S, N, n, N, n), 2, 3)
         i, j = self.receiver[first], self.sender[first]
         k, m = self.receiver[second], self.sender[second]
         # E[(e_j - e_i)(e_m - e_k)'] of the senders j, m and the receivers i, k of each pair.
-        gap = blocks[j, m] - blocks[j, k] - blocks[i, m] + blocks[i, k]
+        gap = blocks[:, j, m] - blocks[:, j, k] - blocks[:, i, m] + blocks[:, i, k]
         turned = np.swapaxes(self.weight[second], 1, 2)
-        total = np.zeros_like(blocks)
-        np.add.at(total, (i, k), factor[:, None, None] * (self.weight[first] @ gap @ turned))
-        return _join_blocks(total)
+        terms = factor[:, :, None, None] * (self.weight[first] @ gap @ turned)
+        blocks_out = np.zeros_like(blocks)
+        _add_blocks(blocks_out, i, k, terms)
+        return _join_blocks(blocks_out)
 
     def joint(self, first: IntArray, second: IntArray) -> FloatArray:
-        """Return the probability (P,) that both of each pair of directions arrive."""
-        p, q = self.delivery[first], self.delivery[second]
+        """Return the probability (S, P), by mode, that both of each pair of directions arrive."""
+        p, q = self.delivery[:, first], self.delivery[:, second]
         # Directions of one source share one uniform draw, unless one of both senders has one fate
         # for all of its hearers, which then share a draw: both arrive if it is below min(p, q).
         same = np.where(
@@ -88,10 +135,16 @@ class Directions(NamedTuple):
         return np.asarray(same * np.minimum(p, q) + (1.0 - same) * p * q)
 
 
+def _add_blocks(blocks: FloatArray, rows: IntArray, columns: IntArray, terms: FloatArray) -> None:
+    """Add P terms (S, P, n, n) to ``blocks`` at nodes that may repeat."""
+    index: Any = (slice(None), rows, columns)
+    np.add.at(blocks, index, terms)
+
+
 def _join_blocks(blocks: FloatArray) -> FloatArray:
-    """Return the matrix (N n, N n) that consists of ``blocks`` (N, N, n, n)."""
-    N, _, n, _ = blocks.shape
-    return np.asarray(np.swapaxes(blocks, 1, 2).reshape(N * n, N * n))
+    """Return the matrices (S, N n, N n) that consist of ``blocks`` (S, N, N, n, n)."""
+    S, N, _, n, _ = blocks.shape
+    return np.asarray(np.swapaxes(blocks, 2, 3).reshape(S, N * n, N * n))
 
 
 def directions_of(
@@ -100,19 +153,24 @@ def directions_of(
     """Return directed links in the order of ``weights``, with the law of losses; messages that take
     more than ``wait`` seconds are lost. Raises TheoryError without a known law.
     """
-    delay, links, index = _known_delay(scenario), list(weights), scenario.topology.index
+    loss, delay = scenario.network.channel.loss, _known_delay(scenario)
+    links, index = list(weights), scenario.topology.index
     # One draw decides about both directions of a link that are activated and lost together.
     together = scenario.network.one_fate
     owners = [min(link, link[::-1]) if together else link for link in links]
     at = {owner: k for k, owner in enumerate(dict.fromkeys(owners))}
-    delivery = np.array([delivery_of(scenario, link) for link in links])
+    source = np.array([at[owner] for owner in owners], dtype=np.int64)
+    delivery = _deliveries(scenario, links, source, len(at))
+    if delay > wait:
+        delivery = np.zeros_like(delivery)
     return Directions(
         np.array([index[i] for i, _ in links], dtype=np.int64),
         np.array([index[j] for _, j in links], dtype=np.int64),
         np.stack(list(weights.values())),
-        np.array([at[owner] for owner in owners], dtype=np.int64),
-        delivery if delay <= wait else np.zeros_like(delivery),
-        scenario.network.channel.loss.fate_share if scenario.has_broadcasts else 0.0,
+        source,
+        delivery,
+        loss.fate_share if scenario.has_broadcasts else 0.0,
+        loss.transitions if isinstance(loss, GilbertElliott) and not loss.independent else None,
     )
 
 
@@ -134,8 +192,9 @@ def _known_delay(scenario: Scenario) -> float:
         raise TheoryError("exact mean squares are known for no delay or a fixed one, not a random")
     if not has_constant_losses(scenario):
         raise TheoryError("messages of one link are lost with different probabilities")
-    if not loss.independent:
-        raise TheoryError("losses depend on earlier ones; exact mean squares need independent ones")
+    is_chain = isinstance(loss, GilbertElliott) and loss.chain is not None
+    if not (is_chain or loss.independent):
+        raise TheoryError("losses depend on earlier ones in a way that is not known here")
     if loss.state_of != "link":
         raise TheoryError("the links of a sender share their bursts, which is not known here")
     return delay
@@ -190,6 +249,30 @@ def has_constant_losses(scenario: Scenario) -> bool:
         has_one_probability(loss, scenario.transmission(direction), scenario.horizon)
         for direction in scenario.topology.directions
     )
+
+
+def _deliveries(
+    scenario: Scenario, links: list[tuple[int, int]], source: IntArray, chains: int
+) -> FloatArray:
+    """Return the delivery probabilities (S, K) of ``links`` by mode of the bursty channels."""
+    loss = scenario.network.channel.loss
+    if isinstance(loss, GilbertElliott) and loss.independent:
+        return np.array([[scenario.mean_delivery(link) for link in links]])
+
+    def probabilities(bad: bool) -> FloatArray:
+        """Return the probabilities (K,) if all channels are in their bad state, or good one."""
+        sent = (scenario.transmission(link)._replace(bad=bad) for link in links)
+        return np.array([float(loss.delivery_probability(one)) for one in sent])
+
+    if not isinstance(loss, GilbertElliott):
+        return np.array([[delivery_of(scenario, link) for link in links]])
+    if chains > MAX_CHAINS:
+        raise TheoryError(
+            f"bursts on {chains} links have 2^{chains} joint states; exact mean squares are "
+            f"computed for at most {MAX_CHAINS} links with bursts"
+        )
+    modes = np.arange(1 << chains)
+    return np.where(modes[:, None] >> source & 1, probabilities(True), probabilities(False))
 
 
 def poisson_ticks(

@@ -46,8 +46,10 @@ def second_moment_rate(scenario: Scenario) -> float:
     system = _linear_recursion(scenario, steady_covariance_bound(scenario))
 
     def equation(flat: FloatArray) -> FloatArray:
-        Y = np.asarray(flat, dtype=np.float64).reshape(size, size)
-        return np.asarray(system.flow @ Y + Y @ system.flow.T + system.inflow(Y)).reshape(-1)
+        Y = np.asarray(flat, dtype=np.float64).reshape(system.shape)
+        half = system.flows @ Y
+        other = Y @ np.swapaxes(system.flows, 1, 2)
+        return np.asarray(half + other + system.inflow(Y)).reshape(-1)
 
     operator = scipy.sparse.linalg.LinearOperator((size**2, size**2), equation, dtype=float)
     # The equation preserves positive semidefinite Y: start inside that cone.

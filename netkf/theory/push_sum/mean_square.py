@@ -133,18 +133,18 @@ def _radius(law: Averaging, closed: FloatArray) -> float:
             f"mean squares of {size:,} errors that mix are {size:,}^2 numbers; they are computed "
             f"for at most {MAX_ROWS} errors, so take a smaller network"
         )
-    return spectral_radius(second_moment_map(law, closed), size)
+    return spectral_radius(second_moment_map(law, closed), (1, size, size))
 
 
 def second_moment_map(law: Averaging, closed: FloatArray) -> PositiveMap:
-    """Return ``T(X) = E[M diag(A_j) X diag(A_j)' M']`` of (N n, N n), loops ``closed``."""
+    """Return ``T(X) = E[M diag(A_j) X diag(A_j)' M']`` of (1, N n, N n), loops ``closed``."""
     N, n, _ = closed.shape
 
     def left(X: FloatArray) -> FloatArray:
         """Return the product diag(A_j) X (N n, N n) with X (N n, N n), of block diagonal A_j."""
         return np.asarray(closed @ X.reshape(N, n, N * n)).reshape(X.shape)
 
-    return lambda X: symmetric(law.second_moment(left(left(X).T)))
+    return lambda X: symmetric(law.second_moment(left(left(X[0]).T)))[None]
 
 
 def push_sum_error_covariance(scenario: Scenario) -> FloatArray:
@@ -171,7 +171,7 @@ def _covariance(steps: EstimationSteps, value: float) -> FloatArray:
     # States in units of P_inf's deviations; then the stacked second moments X of all nodes solve
     # X = T(X) + E[(M (x) I) cov(h) (M (x) I)'] with M the averaging and h the noises of a slot.
     noise = symmetric(steps.averaging.second_moment(steps.noise / np.outer(scales, scales)))
-    X = fixed_point(second_moment_map(steps.averaging, steps.scaled), noise, value)
+    X = fixed_point(second_moment_map(steps.averaging, steps.scaled), noise[None], value)[0]
     nodes = np.arange(N)
     blocks = X.reshape(N, n, N, n)[nodes, :, nodes]
     return symmetric(blocks * np.outer(scale, scale))
