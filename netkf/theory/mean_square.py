@@ -53,9 +53,11 @@ def steady_error_covariance(scenario: Scenario) -> FloatArray:
     By one generalised Lyapunov equation, for filters whose gains are constant: ``constant-gain``,
     ``kcf`` in slots with its own readings or without losses, ``track-fusion`` by
     cross-covariances, ``local`` and ``central`` in slots. Losses may be independent, by link or
-    bursty (Gilbert-Elliott, few links), delays none or, in slots, fixed (a message that is late is
-    lost), clocks Poisson; at most 200 errors of all nodes together. Raises TheoryError with the
-    reason where there is no such mean, or it is not known.
+    bursty (Gilbert-Elliott, few links), delays none or fixed (not under Poisson clocks; below the
+    period of periodic clocks; in slots a message that is late is lost), clocks Poisson, or periodic
+    and all together (the mean is then that at exchanges, after them); at most 200 errors of all
+    nodes together. Raises TheoryError with the reason where there is no such mean, or it is not
+    known.
     """
     radius, covariance = _solve(scenario)
     if covariance is None:

@@ -12,7 +12,7 @@ from netkf import theory
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.network.losses import Transmission
 from netkf.theory.promises import compute_promises, promises_text
-from tests.algorithms.test_literature import ROTATION, scenario_of
+from tests.algorithms.test_literature import ROTATION, discretised, scenario_of
 
 GAIN = [[0.4], [0.15]]
 CONSTANT = {"kind": "constant-gain", "gain": GAIN}
@@ -297,6 +297,71 @@ def test_clocks_at_links_directions_and_nodes(at, channel, tmp_path):
     np.testing.assert_allclose(found[:, 0, 0], np.diag(X), rtol=1e-9)
 
 
+EACH = {"kind": "periodic", "period": 0.5}
+
+
+@pytest.mark.parametrize("channel", ["lossless", "losses", "losses of both"])
+def test_periodic_clocks_with_samples_at_their_ticks_are_slots(channel, tmp_path):
+    """Over the exact discretisation of the plant."""
+    A, B = np.array(ROTATION["A"]), np.array(ROTATION["B"])
+    F, Q = discretised(A, B @ B.T, 0.5)
+    plant = {"kind": "linear", "F": F.tolist(), "Q": Q.tolist(), "period": 0.5}
+    plant["cov"] = ROTATION["cov"]
+    chosen = {**CHANNELS, "lossless": {}}[channel]
+    symmetric = chosen.get("symmetric", True)
+    network = {"graph": PATH, "channel": chosen}
+    clock = {**EACH, "at": "links" if symmetric else "nodes"}
+    over, times = {"plant": ROTATION, "probe": 1.0}, {"horizon": 5.0}
+    sampled = scenario_of(
+        CONSTANT, tmp_path, sensors=[{**SENSOR, "sampling": EACH}],
+        network={**network, "activation": clock}, **over, **times,
+    )  # fmt: skip
+    slotted = scenario_of(
+        CONSTANT, tmp_path, sensors=[SENSOR], plant=plant, probe=1.0,
+        network={**network, "activation": {"kind": "broadcast"}}, **times,
+    )  # fmt: skip
+    expected = theory.steady_error_covariance(slotted)
+    np.testing.assert_allclose(theory.steady_error_covariance(sampled), expected, rtol=1e-9)
+    radius = theory.mean_square_radius(slotted)
+    assert theory.mean_square_radius(sampled) == pytest.approx(radius, rel=1e-9)
+
+
+@pytest.mark.slow
+def test_messages_that_take_time_under_periodic_clocks(tmp_path):
+    """Against the errors of a long run without losses, which follow from its events alone."""
+    sensor = {**SENSOR, "sampling": EACH}
+    network = {"graph": PATH, "activation": {**EACH, "at": "links"}}
+    network["channel"] = {"delay": {"kind": "constant", "seconds": 0.125}}
+    times = {"horizon": 60.0, "probe": [58.0, 58.625]}
+    scenario = scenario_of(
+        CONSTANT, tmp_path, plant=ROTATION, sensors=[sensor], network=network, **times
+    )
+    exact = theory.error_covariance(scenario, netkf.simulate(scenario, engine="simpy"))[1]
+    np.testing.assert_allclose(theory.steady_error_covariance(scenario), exact, rtol=1e-7)
+    late = scenario.replace({"network.channel.delay": {"kind": "constant", "seconds": 0.5}})
+    with pytest.raises(netkf.TheoryError, match="where it is below the period"):
+        theory.steady_error_covariance(late)
+
+
+def test_increments_between_periodic_ticks(tmp_path):
+    """One node reads without pause, another hears it every T seconds: closed forms of a scalar."""
+    a, L, R, T, w = 0.2, 1.3, 0.5, 0.8, 0.5
+    scenario = scalar(tmp_path, a, 1.0)
+    activation = {"kind": "periodic", "period": T, "at": "directions"}
+    scenario = scenario.replace({"network.activation": activation})
+    d = a - L
+    X00 = (1.0 + L * L * R) / (-2.0 * d)
+    # Over a gap: X01 -> e^{(d + a) T} X01 + q01 and X11 -> e^{2 a T} X11 + q11, then the reset.
+    f01, f11 = math.exp((d + a) * T), math.exp(2.0 * a * T)
+    q01, q11 = (f01 - 1.0) / (d + a), (f11 - 1.0) / (2.0 * a)
+    X01 = ((1.0 - w) * q01 + w * X00) / (1.0 - (1.0 - w) * f01)
+    before = f01 * X01 + q01
+    right = (1.0 - w) ** 2 * q11 + 2.0 * w * (1.0 - w) * before + w * w * X00
+    X11 = right / (1.0 - (1.0 - w) ** 2 * f11)
+    found = theory.steady_error_covariance(scenario)
+    np.testing.assert_allclose(found[:, 0, 0], [X00, X11], rtol=1e-10)
+
+
 # Refusals, and what netkf theory prints.
 
 
@@ -308,7 +373,7 @@ def test_what_has_no_constant_gains_is_refused_with_the_reason(tmp_path):
         "network": {"graph": PATH, "activation": activation},
         "sensors": [{**SENSOR, "sampling": periodic}],
     }
-    apart = {"graph": PATH, "activation": {**periodic, "at": "nodes"}}
+    apart = {"graph": PATH, "activation": {**EACH, "at": "nodes"}}
     bursts = {"graph": {"kind": "complete", "nodes": 6}, "activation": {"kind": "broadcast"}}
     bursts |= {"channel": {"loss": BURSTS}}
     late = {"kind": "constant", "seconds": 0.1}
@@ -325,8 +390,8 @@ def test_what_has_no_constant_gains_is_refused_with_the_reason(tmp_path):
             "known for no delay or a fixed one",
         ),
         (
-            scenario_of(CONSTANT, tmp_path, **{**clocked, "network": apart, "sensors": [SENSOR]}),
-            "do not transmit by Poisson clocks",
+            scenario_of(CONSTANT, tmp_path, **{**clocked, "network": apart}),
+            "do not sample at the ticks",
         ),
         (scalar(tmp_path, 0.1, 5.0, delay=late), "take no time"),
     ]
