@@ -16,7 +16,7 @@ from sphinx.util.inspect import TypeAliasForwardRef, stringify_signature
 
 from netkf import __version__, parts
 from netkf.core.fields import Component
-from netkf.scenario.schema_page import schema_page
+from netkf.scenario.schema import schema_page
 
 sys.path.insert(0, str(Path(__file__).parent))
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from netkf.neighbours.models import from_control, from_filterpy
     from netkf.neighbours.perfetto import export_perfetto
     from netkf.report.embedded import page
-    from netkf.runs.held_out import held_out_errors
+    from netkf.runs.readings import held_out_errors
     from netkf.runs.run import save
     from netkf.runs.simulate import simulate
     from netkf.scenario.model import Belief, Filtering, Network
@@ -66,7 +66,7 @@ _MODULE_OF = {
     "fit_noise": "netkf.studies.likelihood",
     "from_control": "netkf.neighbours.models",
     "from_filterpy": "netkf.neighbours.models",
-    "held_out_errors": "netkf.runs.held_out",
+    "held_out_errors": "netkf.runs.readings",
     "import_log": "netkf.logs.importing",
     "innovations": "netkf.studies.innovation_tests",
     "load": "netkf.scenario.reading",

@@ -8,7 +8,7 @@ import pytest
 
 from netkf.cli.main import make_parser
 from netkf.scenario.registry import KINDS
-from netkf.scenario.schema_page import schema_page
+from netkf.scenario.schema import schema_page
 from tests.conftest import ROOT, SCENARIOS
 from tests.documents import blocks
 

@@ -21,9 +21,18 @@ ONE_THREAD = ("check", "work", "merge")
 """Commands whose runs have the same last digits here and in workers, whose LAPACK has one thread.
 """
 SHARED = {
-    **dict.fromkeys(("compare", "consistency", "import", "innovations", "new"), "short"),
-    **dict.fromkeys(("report", "schema", "theory"), "short"),
-    **dict.fromkeys(("plan", "work", "merge"), "planned"),
+    "short": (
+        "compare",
+        "consistency",
+        "import",
+        "innovations",
+        "new",
+        "report",
+        "schema",
+        "theory",
+    ),
+    "planned": ("plan", "work", "merge"),
+    "studies": ("sweep", "size", "compare_filters"),
 }
 """Modules of several commands, which have ``run_NAME``."""
 BESIDE = (("tasks", "plan"), ("slurm", "plan"), ("time", "slurm"), ("most", "until"))
@@ -80,8 +89,9 @@ class Command(NamedTuple):
     def _run(self, options: argparse.Namespace) -> int:
         # Only now, so that ``netkf --help`` and usage errors do not wait for numpy and numba.
         name = self.name.replace("-", "_")
-        module: Any = import_module(f"netkf.cli.{SHARED.get(name, name)}")
-        run = getattr(module, f"run_{name}" if name in SHARED else "_run")
+        shared = next((module for module, names in SHARED.items() if name in names), "")
+        module: Any = import_module(f"netkf.cli.{shared or name}")
+        run = getattr(module, f"run_{name}" if shared else "_run")
         if getattr(options, "plan", None) is not None:
             from netkf.cli.planned import plan_study
 

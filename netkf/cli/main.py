@@ -121,8 +121,7 @@ def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line, with one subparser for each of COMMANDS."""
     import netkf
     from netkf.cli.commands import COMMANDS
-    from netkf.cli.completion import add_completion
-    from netkf.cli.options import Parser
+    from netkf.cli.options import Parser, add_completion
 
     parser = Parser(
         prog="netkf",

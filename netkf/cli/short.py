@@ -57,7 +57,7 @@ def run_new(options: argparse.Namespace) -> int:
 def run_schema(options: argparse.Namespace) -> int:
     """``netkf schema``: print the JSON Schema of scenario files, for editors."""
     if options.markdown:
-        from netkf.scenario.schema_page import schema_page
+        from netkf.scenario.schema import schema_page
 
         print(schema_page(), end="")
     else:

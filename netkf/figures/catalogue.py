@@ -8,12 +8,11 @@ from typing import Any
 
 from netkf.core.errors import ScenarioError, TheoryError, suggest_nearest
 from netkf.figures.consistency import nees_figure, nis_figure, whiteness_figure
-from netkf.figures.envelope import envelope_figure
 from netkf.figures.error import error_figure, quantiles_figure, ratios_figure
 from netkf.figures.figure_data import FigureData, UnavailableError, reduce_result
 from netkf.figures.names import FIT_FIGURES, FORMATS
 from netkf.figures.network import network_figure
-from netkf.figures.outcomes import fate_figure, losses_figure, matrix_figure
+from netkf.figures.outcomes import envelope_figure, fate_figure, losses_figure, matrix_figure
 from netkf.figures.pictures import overview
 from netkf.figures.plane import plane_figure
 from netkf.figures.several import curves_of, errors_figure

@@ -13,9 +13,9 @@ from netkf.checks.innovations import Innovations
 from netkf.core.printable import count_phrase
 from netkf.engines.soundness import describe_divergence
 from netkf.linalg.arrays import FloatArray
+from netkf.report.data import information_age
 from netkf.report.directories import ReportSource
 from netkf.report.innovations import describe_innovations
-from netkf.report.messages import information_age
 from netkf.report.replicas import describe_replica
 from netkf.report.worst import StartUp, WorstSample, WorstSamples, summary_samples
 from netkf.runs.outcomes import downtimes
@@ -23,7 +23,7 @@ from netkf.runs.stored import StoredRun
 from netkf.runs.summary import CONFIDENCE
 from netkf.runs.tables import format_number, format_with_error
 from netkf.studies.compare import Comparison, Entry, quantity_label
-from netkf.studies.stored import StoredComparison
+from netkf.studies.opening import StoredComparison
 from netkf.theory.common.papers import PAPERS
 from netkf.trace.messages import DELIVERED, LATE, LOST
 from netkf.trace.run import first_difference

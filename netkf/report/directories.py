@@ -21,9 +21,8 @@ from netkf.runs.stored import StoredRun, read_checked_document
 from netkf.runs.summary import PromisedTraces
 from netkf.scenario.scenario import Scenario
 from netkf.studies.compare import damage_named
-from netkf.studies.opening import StoredSweep
+from netkf.studies.opening import VERDICT, StoredComparison, StoredSweep, StoredVerdict
 from netkf.studies.opening import open as open_directory
-from netkf.studies.stored import VERDICT, StoredComparison, StoredVerdict
 
 MAX_TEXT = 200_000
 """Characters of a scenario file that a page repeats."""

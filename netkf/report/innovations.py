@@ -10,7 +10,7 @@ from netkf.checks.innovations import Innovations, autocorrelations, compute_inno
 from netkf.core.errors import NetkfError
 from netkf.linalg.arrays import FloatArray
 from netkf.report.directories import ReportSource
-from netkf.report.packing import Packer
+from netkf.report.markup import Packer
 from netkf.runs.stored import StoredRun
 from netkf.runs.summary import NORMAL_QUANTILE, chi_square_interval
 from netkf.runs.tables import format_number

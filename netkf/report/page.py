@@ -24,12 +24,10 @@ from netkf.report import tables
 from netkf.report.claims import describe_differences, describe_source
 from netkf.report.data import Budget, positions, run_data, thinning_rules
 from netkf.report.directories import ReportSource, read_source
-from netkf.report.filter_figure import filters_figure
 from netkf.report.innovations import read_innovations
-from netkf.report.markup import bullets, content_hash, paragraph, script_json, section, text
+from netkf.report.markup import Packer, bullets, content_hash, paragraph, script_json, section, text
 from netkf.report.mending import describe_central, describe_mending, explain_worst, mending_section
-from netkf.report.outcome_figure import outcome_figures
-from netkf.report.packing import Packer
+from netkf.report.outcome_figure import filters_figure, outcome_figures
 from netkf.runs.documents import FINAL_STATUSES, DamagedError
 from netkf.runs.files import require_own, write_text
 from netkf.scenario.writing import toml_text

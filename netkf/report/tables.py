@@ -24,7 +24,7 @@ from netkf.runs.tables import (
 )
 from netkf.studies.compare import Comparison, Entry, quantity_label
 from netkf.studies.filter_values import JUDGED, Quantity
-from netkf.studies.stored import StoredComparison
+from netkf.studies.opening import StoredComparison
 from netkf.trace.nees import traces
 
 MAX_ROWS = 2_000

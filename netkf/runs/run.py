@@ -204,7 +204,7 @@ class _Output:
             usage = record_usage(self.scenario, self.links[0].sent.counts() if self.links else {})
             summary |= {"records": usage} if usage else {}
             if self.scenario.held_out_sensors:
-                from netkf.runs.held_out import errors_of_replica
+                from netkf.runs.readings import errors_of_replica
 
                 manifest = self.manifest
                 summary["held_out"] = errors_of_replica(

@@ -26,11 +26,15 @@ from netkf.plants.diffusion import Diffusion
 from netkf.plants.inputs import Input
 from netkf.plants.maps import NonlinearPlant
 from netkf.plants.regressors import RegressorSensor
-from netkf.scenario.compatibility import check_activation, check_time, filter_name
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.model import takes_samples
 from netkf.scenario.positions import check_positions
-from netkf.scenario.preconditions import check_preconditions
+from netkf.scenario.preconditions import (
+    check_activation,
+    check_preconditions,
+    check_time,
+    filter_name,
+)
 from netkf.scenario.records import check_records
 from netkf.scenario.registry import explain_time_mismatch, kind_name
 from netkf.scenario.sampling import check_sampling, uses_grid

@@ -15,14 +15,15 @@ from netkf.ensembles.pool import Pool
 from netkf.ensembles.replicas import replicate_blocks
 from netkf.runs.quantities import ensemble_names
 from netkf.scenario.scenario import Scenario
-from netkf.studies.help import BEYOND, describe_help
 from netkf.studies.metrics import METRICS, central_traces, join_batches
 from netkf.studies.targets import (
+    BEYOND,
     MISSED,
     NOT_SHOWN,
     REACHED,
     UNDECIDED,
     Target,
+    describe_help,
     quantity_by_simulation,
     quantity_by_theory,
     theory_is_exact,

@@ -1,4 +1,4 @@
-"""Targets for sizing: a quantity of a scenario by theory and by simulation."""
+"""Targets for sizing: a quantity by theory and by simulation, and what would help to reach it."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy
 
-from netkf.core.errors import ScenarioError, TheoryError
+from netkf.core.errors import NetkfError, ScenarioError, TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.network.lives import DutyCycle, RecordedLife
 from netkf.runs.quantities import NETWORK, has_ages
+from netkf.runs.tables import format_number
 from netkf.scenario.scenario import Scenario
 from netkf.studies.metrics import RunMetrics, bound_traces, central_traces, over_central
 from netkf.theory import assumptions
@@ -237,3 +238,77 @@ def _student_ends(columns: FloatArray, tail: float) -> tuple[FloatArray, FloatAr
         error = columns.std(axis=0, ddof=1) / math.sqrt(runs)
         width = float(scipy.special.stdtrit(runs - 1, 1.0 - tail)) * error
         return mean, mean - width, mean + width
+
+
+STEP = 1.1
+"""Factor by which keys are changed to see which helps."""
+LESS = 1.0 - 1e-6
+"""Ratio of the quantity to before from which a key does not help."""
+BEYOND = "no exchange of messages reaches the limit, better readings may"
+"""End of the sentence where the centralised filter, whose errors are the smallest, misses it."""
+
+
+def describe_help(scenario: Scenario, target: Target, searched: str) -> str:
+    """Return a sentence on the centralised filter, and which key other than ``searched`` would
+    change the quantity of the ``target`` most, by theory; empty if theory knows neither.
+    """
+    if target.of_runs:
+        return ""
+    try:
+        traces = central_traces(scenario)
+    except NetkfError:
+        return ""
+    has_roots = target.of_errors and target.quantity != "within_central"
+    trace = float(traces.max() if target.of_worst else traces.mean())
+    value = math.sqrt(trace) if target.of_errors else trace
+    name = "RMS error" if target.of_errors else "trace of P"
+    sentence = f"a centralised filter has {name} {format_number(value)} there"
+    if has_roots and value > target.limit:
+        return f"{sentence}: {BEYOND}"
+    changes = sorted(_changes(scenario, target, searched))
+    if not changes or changes[0][0] >= LESS:
+        return sentence
+    listed = [
+        f"{key} = {text} ({100.0 * (ratio - 1.0):+.2g} %)" for ratio, key, text in changes[:2]
+    ]
+    return f"{sentence}; by theory {target.quantity} would fall most with {', then '.join(listed)}"
+
+
+def _changes(scenario: Scenario, target: Target, searched: str) -> list[tuple[float, str, str]]:
+    """Return for keys changed by STEP the ratio of the quantity to before, the key and value."""
+    try:
+        before = quantity_by_theory(scenario, target)[0]
+    except NetkfError:
+        return []
+    found = []
+    for key, changes, shown in _candidates(scenario):
+        if key == searched:
+            continue
+        try:
+            after = quantity_by_theory(scenario.replace(changes), target)[0]
+        except NetkfError:
+            continue
+        found.append((after / before, key, shown))
+    return found
+
+
+def _candidates(scenario: Scenario) -> list[tuple[str, dict[str, Any], str]]:
+    clock, loss = scenario.network.activation, scenario.network.channel.loss
+    algorithm, found = scenario.filter.algorithm, []
+    for key, part, name in (
+        ("network.activation.rate", clock, "rate"),
+        ("network.channel.loss.delivery", loss, "delivery"),
+        ("filter.epsilon", algorithm, "epsilon"),
+    ):
+        value = getattr(part, name, None)
+        if not isinstance(value, float):
+            continue
+        steps = [value * STEP, value / STEP] if name == "epsilon" else [value * STEP]
+        steps = [min(step, 1.0) if name == "delivery" else step for step in steps]
+        found += [(key, {key: s}, f"{s:.3g}") for s in steps if s != value]
+    noises = [getattr(sensor, "R", None) for sensor in scenario.sensors]
+    known = [np.asarray(R) for R in noises if R is not None]
+    if known and len(known) == len(noises):
+        changes = {f"sensors.{k}.R": (R / STEP).tolist() for k, R in enumerate(known)}
+        found.append(("sensors.*.R", changes, "less by a tenth"))
+    return found

@@ -13,8 +13,8 @@ from netkf.cli.main import main
 from netkf.ensembles.pools import PoolOptions
 from netkf.figures import plane
 from netkf.figures.catalogue import FIGURES, FigureSet, plot_to_files
-from netkf.figures.envelope import envelope_figure
 from netkf.figures.names import FIGURE_NAMES
+from netkf.figures.outcomes import envelope_figure
 from netkf.figures.several import errors_figure
 from netkf.figures.style import style_context
 from netkf.runs.curves import ErrorCurve

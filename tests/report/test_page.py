@@ -26,11 +26,10 @@ from netkf.ensembles.pools import PoolOptions
 from netkf.figures.style import SEQUENTIAL
 from netkf.report import page as pages
 from netkf.report.claims import describe_source
-from netkf.report.data import Budget, sample_indices
+from netkf.report.data import Budget, information_age, sample_indices, thin_messages
 from netkf.report.directories import read_source
 from netkf.report.markup import script_json
 from netkf.report.mending import describe_mending, explain_worst
-from netkf.report.messages import information_age, thin_messages
 from netkf.report.page import make_page
 from netkf.report.tables import difference_curves
 from netkf.runs.documents import file_digests, write_sealed
