@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from functools import partial
 from typing import TYPE_CHECKING
@@ -28,6 +28,7 @@ from netkf.checks.evidence import (
     BASE,
     BROKEN,
     NOT_PROMISED,
+    UNDECIDED,
     VERDICTS,
     Assumption,
     Evidence,
@@ -39,7 +40,6 @@ from netkf.checks.evidence import (
     judge,
 )
 from netkf.checks.exact import promised_filter, with_base_filter, with_promised_filter
-from netkf.checks.looks import MAX_LOOKED_RUNS, is_decided, keep_decisions, level_of_look, next_runs
 from netkf.checks.paper import PaperChecks
 from netkf.checks.parts.network_rows import loss_assumptions
 from netkf.checks.parts.rows import gaussian_noises, part_promises
@@ -74,6 +74,12 @@ MIN_RUNS, USUAL_RUNS = 10, 500
 """Smallest number of runs of a check, and that of networks of up to MANY_NODES."""
 MANY_NODES, MANY_ERRORS = 100, 20_000
 """Larger networks take as many runs as have MANY_ERRORS nodes together, if none is given."""
+MAX_LOOKED_RUNS = 20_000
+"""Default limit on the runs of a check with ``until = "decided"``."""
+MIN_GROWTH, MAX_GROWTH = 1.5, 6.0
+"""Limits of the factor by which the runs grow from one look to the next."""
+MARGIN = 1.1
+"""Factor on the forecast number of runs: the next look has a smaller level and wider intervals."""
 TWIN_RUNS = 10
 """Replicas of a user's class that are also run with the built-in filter that it derives from."""
 TWIN_TOLERANCE = 1e-6
@@ -103,7 +109,7 @@ class Verdict(NotebookTable):
     @property
     def is_decided(self) -> bool:
         """True if more runs would decide no further row."""
-        return is_decided(self.rows)
+        return not any(row.verdict == UNDECIDED and row.needed is not None for row in self.rows)
 
     def __bool__(self) -> bool:
         return all(row.verdict != BROKEN for row in self.rows)
@@ -423,6 +429,32 @@ def check(
             if not until or not verdict or verdict.is_decided or count >= last:
                 return verdict
             count = next_runs(verdict.rows, count, last)
+
+
+def level_of_look(level: float, look: int) -> float:
+    """Return the part of ``level`` that look number ``look`` = 1, 2, ... may spend (alpha
+    spending), so that the intervals of all looks hold jointly, whenever one stops.
+    """
+    return float(level * 2.0**-look)
+
+
+def next_runs(rows: Sequence[Evidence], runs: int, max_runs: int) -> int:
+    """Return the runs of the next look, as forecast, MIN_GROWTH to MAX_GROWTH times ``runs``."""
+    needed = [row.needed for row in rows if row.verdict == UNDECIDED and row.needed is not None]
+    forecast = MARGIN * max(needed, default=runs)
+    growth = min(max(forecast, MIN_GROWTH * runs), MAX_GROWTH * runs)
+    return min(max_runs, math.ceil(growth))
+
+
+def keep_decisions(earlier: Sequence[Evidence], rows: Sequence[Evidence]) -> tuple[Evidence, ...]:
+    """Return the new ``rows``, undecided ones with an ``earlier`` decision: all intervals hold."""
+    earlier_rows = {(row.promise, row.source): row for row in earlier}
+    decisions = []
+    for row in rows:
+        old = earlier_rows.get((row.promise, row.source), row)
+        undecided = row.verdict == UNDECIDED and old.verdict != UNDECIDED
+        decisions.append(old if undecided or old.verdict == BROKEN else row)
+    return tuple(decisions)
 
 
 def _look_again(

@@ -185,7 +185,9 @@ def _pool_nees(e: FloatArray, P: FloatArray, law: ErrorLaw) -> FloatArray:
     # eigenvalues of L C L'; here L' L = P^-1.
     L = np.linalg.inv(np.linalg.cholesky(law.P)).reshape(-1, n, n)
     blocks = law.covariance.reshape(len(L), n, len(L), n)
-    scales = nees_shares(np.einsum("iab,ibic,idc->iad", L, blocks, L, optimize=True))
+    # Scaled to the expected value n, so that none outweighs the others.
+    expected = np.einsum("iab,ibic,iac->i", L, blocks, L, optimize=True)
+    scales = np.divide(n, expected, out=np.zeros(len(L)), where=expected > 0.0)
     nees = np.einsum("kia,kia->ki", e, np.linalg.solve(P, e[..., None])[..., 0])
     total = (scales * nees.ravel()).sum()
     L = np.sqrt(scales)[:, None, None] * L
@@ -193,17 +195,6 @@ def _pool_nees(e: FloatArray, P: FloatArray, law: ErrorLaw) -> FloatArray:
         e.size, e.size
     )
     return np.append(total, np.maximum(np.linalg.eigvalsh(quadratic_form), 0.0))
-
-
-def nees_shares(whitened: FloatArray) -> FloatArray:
-    """Return the factors (K,) that scale each of K NEES to the expected value n, so that none
-    outweighs the others: ``whitened`` (K, n, n) is L Sigma L' with L' L = P^-1, its trace the
-    expected NEES.
-    """
-    expected = np.trace(whitened, axis1=-2, axis2=-1)
-    return np.asarray(
-        np.divide(whitened.shape[-1], expected, out=np.zeros(len(expected)), where=expected > 0)
-    )
 
 
 def _nearly_singular(P: FloatArray) -> np.ndarray:
@@ -462,14 +453,10 @@ def check_nees(samples: RunSamples, level: float) -> Finding:
     finding = compare_chi_square(nees / n, freedom, samples.point_labels, level / 2.0, "NEES")
     finite = nees[:, np.isfinite(nees).all(axis=0)]
     if finite.size:
-        # A chi-square variable with n degrees of freedom has mean n and half of its variance n.
-        expected = np.full(finite.shape, float(n))
-        finding = pool(
-            finding,
-            pooled_nees(finite, expected, expected, level / 2.0),
-            EVERYTHING,
-            NEES_TOLERANCE,
-        )
+        # Points of a run add at most their deviations: they count as one of them.
+        total, count = len(finite) * float(finite.mean()), float(len(finite) * n)
+        pooled = deviation_interval(1.0, scale_interval(total, count, level / 2.0))
+        finding = pool(finding, pooled, EVERYTHING, NEES_TOLERANCE)
     return finding._replace(message=finding.message + samples.blurred_note)
 
 
@@ -498,14 +485,3 @@ def check_nees_bound(samples: RunSamples, level: float) -> Finding:
     detectable = max(interval.detectable for interval in intervals)
     finding = Finding(margin, NEES_TOLERANCE, message, detectable=detectable)
     return finding._replace(seen=float(means[k]), expected=1.0)
-
-
-def pooled_nees(nees: FloatArray, mean: FloatArray, square: FloatArray, level: float) -> Interval:
-    """Return an interval for the relative difference of the sums of NEES (R, K) and of their exact
-    means; ``square`` is half of the variances. Points of a run add at most their deviations.
-    """
-    spread = np.sqrt(2.0 * square).sum(axis=1)
-    expected = float(mean.sum())
-    freedom = 2.0 * expected**2 / float((spread**2).sum())
-    ratio = scale_interval(freedom * float(nees.sum()) / expected, freedom, level)
-    return deviation_interval(1.0, ratio)

@@ -69,8 +69,7 @@ def _check(scenario: Scenario, options: argparse.Namespace) -> int:
 
 
 def _run_check(scenario: Scenario, options: argparse.Namespace, earlier: Verdict | None) -> Verdict:
-    from netkf.checks.check import check
-    from netkf.checks.looks import MAX_LOOKED_RUNS
+    from netkf.checks.check import MAX_LOOKED_RUNS, check
 
     with _explain_interrupt(options, earlier), ProgressLine() as line:
         return check(

@@ -12,10 +12,9 @@ import pytest
 import scipy.stats
 
 import netkf
-from netkf.checks.check import check
+from netkf.checks.check import Verdict, check, keep_decisions, level_of_look, next_runs
 from netkf.checks.evidence import BROKEN, HOLDS, UNDECIDED, Evidence, Promise, judge
 from netkf.checks.laws import find_largest
-from netkf.checks.looks import is_decided, keep_decisions, level_of_look, next_runs
 from netkf.checks.report import verdict_text
 from netkf.checks.statistics import band_around, band_width
 from netkf.checks.storage import load_verdict, save_verdict
@@ -56,9 +55,9 @@ def test_the_next_look_is_where_the_slowest_row_is_decided():
     assert next_runs(rows, 500, 800) == 800
     assert next_runs([row(UNDECIDED, 10**7)], 500, 10**6) == 3000
     assert next_runs([row(UNDECIDED, 510)], 500, 10**6) == 750
-    assert not is_decided(rows)
+    assert not Verdict("", 0, 0, 0.9, tuple(rows)).is_decided
     # Without a forecast more runs decide nothing.
-    assert is_decided([row(HOLDS), row(UNDECIDED)])
+    assert Verdict("", 0, 0, 0.9, (row(HOLDS), row(UNDECIDED))).is_decided
 
 
 def test_decisions_are_kept_and_broken_promises_stay_broken():
