@@ -117,13 +117,18 @@ def _moments(scenario: Scenario, run: Run, about_mean: bool, stacked: bool) -> F
 
 def _errors_of(scenario: Scenario, run: Run) -> ErrorColumns:
     """Return the errors at time 0 of all estimators (the filters of the nodes, or a pooled one)."""
-    _require_known_errors(scenario, run)
+    if not isinstance(run, Run):
+        raise TheoryError(
+            f"run must be a netkf.Run, as netkf.simulate returns it, got a {type(run).__name__}"
+        )
+    if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
+        raise TheoryError("the run is of another scenario: its nodes or its state differ")
+    require_errors(scenario)
     if scenario.slotted:
         run = with_last_exchanges(scenario, run)
+    of_kernels = SlotColumns if scenario.slotted else ClockColumns
     if scenario.model_views is not scenario.views and has_columns(scenario):
-        return SeenErrors(
-            (SlotColumns if scenario.slotted else ClockColumns)(scenario, run), scenario
-        )
+        return SeenErrors(of_kernels(scenario, run), scenario)
     reads_kernels = scenario.node_filter.kernels is not None and scenario.common_entries
     if takes_columns(scenario.node_filter) and not reads_kernels:
         return (SlotBlocks if scenario.slotted else ClockBlocks)(scenario, run)
@@ -135,23 +140,13 @@ def _errors_of(scenario: Scenario, run: Run) -> ErrorColumns:
         name = type(scenario.node_filter).__name__
         raise TheoryError(f"no exact error covariance for {name} of different blocks")
     if has_columns(scenario):
-        return (SlotColumns if scenario.slotted else ClockColumns)(scenario, run)
+        return of_kernels(scenario, run)
     require_known_filter(scenario)
     make = theory_of(scenario).error_columns
     if make is None:
         name = type(scenario.filter.algorithm).__name__
         raise TheoryError(f"no exact error covariance for {name}")
     return make(scenario, run)
-
-
-def _require_known_errors(scenario: Scenario, run: Run) -> None:
-    if not isinstance(run, Run):
-        raise TheoryError(
-            f"run must be a netkf.Run, as netkf.simulate returns it, got a {type(run).__name__}"
-        )
-    if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
-        raise TheoryError("the run is of another scenario: its nodes or its state differ")
-    require_errors(scenario)
 
 
 def require_errors(scenario: Scenario) -> None:

@@ -28,6 +28,7 @@ from netkf.trace.run import Run
 
 LinearErrors = SlotJumps | ClockJumps
 Rows = Callable[[Scenario], list[AssumptionRow]]
+ARRIVES = "every message arrives in its slot"
 
 
 @dataclass(frozen=True)
@@ -56,10 +57,10 @@ class PaperTheory:
     slot_lines: Callable[[dict[str, Any], Callable[[Any], str]], list[str]] | None = None
 
 
-def _no_loss(scenario: Scenario, source: str, arrives: str, otherwise: str) -> AssumptionRow:
+def _no_loss(scenario: Scenario, source: str, arrives: str, otherwise: str) -> list[AssumptionRow]:
     """Return the row that no message is lost, with what follows from that and else."""
     lossless = all_messages_arrive(scenario)
-    return "no message is lost", source, lossless, arrives if lossless else otherwise
+    return [("no message is lost", source, lossless, arrives if lossless else otherwise)]
 
 
 def _tree_rows(scenario: Scenario) -> list[AssumptionRow]:
@@ -78,23 +79,12 @@ def _pair_rows(scenario: Scenario) -> list[AssumptionRow]:
     return [("no node has two neighbours", "Luft et al. 2018", pairs, evidence)]
 
 
-def _pseudo_state_rows(scenario: Scenario) -> list[AssumptionRow]:
-    source, otherwise = "Das and Moura 2017", "gains are those without losses"
-    return [_no_loss(scenario, source, "every message arrives in its slot", otherwise)]
-
-
-def _event_rows(scenario: Scenario) -> list[AssumptionRow]:
-    source, otherwise = "Battistelli et al. 2018", "a sender does not notice a loss"
-    return [_no_loss(scenario, source, "neighbours have what was sent", otherwise)]
-
-
 def _track_rows(scenario: Scenario) -> list[AssumptionRow]:
     analysis = scenario.node_filter.analysis
-    source, rows = analysis.source, model_and_start_rows(scenario, analysis.source)
-    if analysis.P_by_design[0] != "equal":
-        return rows
-    arrives = "every message arrives in its slot"
-    return [*rows, _no_loss(scenario, source, arrives, "P depends on who is heard")]
+    rows = model_and_start_rows(scenario, analysis.source)
+    if analysis.P_by_design[0] == "equal":
+        rows += _no_loss(scenario, analysis.source, ARRIVES, "P depends on who is heard")
+    return rows
 
 
 def _silence_rows(scenario: Scenario) -> list[AssumptionRow]:
@@ -123,12 +113,23 @@ def _reset_rows(scenario: Scenario) -> list[AssumptionRow]:
 OF_PAPERS = {
     "belief_propagation": PaperTheory(slot_conditions=_tree_rows, weight_rows=_tree_rows),
     "block_cross_covariances": PaperTheory(slot_conditions=_pair_rows, weight_rows=_pair_rows),
-    "consensus_innovations": PaperTheory(slot_conditions=_pseudo_state_rows),
+    "consensus_innovations": PaperTheory(
+        slot_conditions=lambda scenario: _no_loss(
+            scenario, "Das and Moura 2017", ARRIVES, "gains are those without losses"
+        )
+    ),
     "constant_gain": PaperTheory(
         slot_jumps=constant_gains.constant_gain_jumps, clock_jumps=constant_gains.clock_jumps
     ),
     "diffusion": PaperTheory(diffusion.slot_rows),
-    "event_triggered": PaperTheory(slot_conditions=_event_rows),
+    "event_triggered": PaperTheory(
+        slot_conditions=lambda scenario: _no_loss(
+            scenario,
+            "Battistelli et al. 2018",
+            "neighbours have what was sent",
+            "a sender does not notice a loss",
+        )
+    ),
     "gossip": PaperTheory(gossip.slot_rows),
     "hybrid": PaperTheory(weight_rows=_reset_rows),
     "information_consensus": PaperTheory(information_consensus.slot_rows),

@@ -25,21 +25,11 @@ from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES, KINDS, rows_of
 
-SENSE, TICK, SEND, DELIVER, LOST, LATE, ABSORB, SWAP, ROUND, STOP, TRANSMIT = (
-    CODES[kind]
-    for kind in (
-        "sense",
-        "tick",
-        "send",
-        "deliver",
-        "lost",
-        "late",
-        "absorb",
-        "swap",
-        "round",
-        "stop",
-        "transmit",
-    )
+SENSE, TICK, SEND, DELIVER, LOST, LATE = (
+    CODES[kind] for kind in ("sense", "tick", "send", "deliver", "lost", "late")
+)
+ABSORB, SWAP, ROUND, STOP, TRANSMIT = (
+    CODES[kind] for kind in ("absorb", "swap", "round", "stop", "transmit")
 )
 CLOCK_RANKS = np.full(len(KINDS), 6)
 """Order of the kinds of events at one instant under clocks: samples, ticks with what they send,

@@ -87,7 +87,9 @@ class ClockColumns(LoggedColumns):
         rate = max(np.abs(plant.A).sum(axis=0).max(), CHECKS / scenario.horizon)
         movable = not len(plant.changes) and np.array_equal(scenario.belief[0], plant.A)
         self._forgetful = frozenset(scenario.forgetful_nodes)
-        self._silent = self._silent_at_first()
+        # Those whose continuous sensors are silent at time 0, as their nodes are down.
+        waking = [self._index[node] for node in scenario.waking_nodes]
+        self._silent = {h for h in waking if self._lives.down[h]}
         # A node that begins again does so with a mean that does not move along, and one whose clock
         # is wrong is at another time.
         movable = movable and not (self._forgetful or self._clocks or scenario.views)
@@ -107,13 +109,6 @@ class ClockColumns(LoggedColumns):
     def _is_up(self, node: int, time: float) -> bool:
         lives = self._scenario.network.lives
         return not lives or not self._lives.is_down(self._index[node], time)
-
-    def _silent_at_first(self) -> set[int]:
-        """Return the estimators (indices) whose continuous sensors are silent at time 0, as their
-        nodes are down.
-        """
-        waking = [self._index[node] for node in self._scenario.waking_nodes]
-        return {h for h in waking if self._lives.down[h]}
 
     def _begin_piece(self, piece: int) -> None:
         if piece < len(self._scenario.model_pieces):

@@ -72,12 +72,9 @@ def _judge_mixing(W: scipy.sparse.csr_array) -> tuple[bool | None, str]:
     """Return whether some power of W (N, N) is positive (None: not known), and why."""
     if len(W.indptr) - 1 > MAX_NODES:
         positive = bool((W.diagonal() > 0.0).all())  # sufficient: every node keeps a share
-        evidence = f"the diameter is not computed beyond {MAX_NODES:,} nodes"
-        return (
-            (True, f"{evidence}; all nodes give themselves a weight")
-            if positive
-            else (None, evidence)
-        )
+        share = "; all nodes give themselves a weight" if positive else ""
+        evidence = f"the diameter is not computed beyond {MAX_NODES:,} nodes{share}"
+        return positive or None, evidence
     # scipy 1.13 searches graphs with 32-bit indices only.
     indices, indptr = W.indices.astype(np.int32), W.indptr.astype(np.int32)
     graph = scipy.sparse.csr_array((W.data, indices, indptr), shape=W.shape)
@@ -146,17 +143,14 @@ def _information_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _arrival_row(scenario: Scenario) -> AssumptionRow:
+    name, source = "every message arrives", "D (8)"
     if lacks_channel_law(scenario):
-        return ("every message arrives", "D (8)", None, no_channel_law(scenario))
-    all_arrive = all_messages_arrive(scenario)
+        return name, source, None, no_channel_law(scenario)
+    if all_messages_arrive(scenario):
+        return name, source, True, "every one in time"
     algorithm: Any = scenario.filter.algorithm
     evidence = (
         f"a message may be lost or late; weights then change ({algorithm.on_loss}): P stays "
         "consistent, but D's theorems are about fixed weights"
     )
-    return (
-        "every message arrives",
-        "D (8)",
-        all_arrive,
-        "every one in time" if all_arrive else evidence,
-    )
+    return name, source, False, evidence

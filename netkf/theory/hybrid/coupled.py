@@ -158,17 +158,8 @@ def require_bound(scenario: Scenario) -> None:
 
 def increment_informations(scenario: Scenario) -> FloatArray:
     """Return ``H_i' R_i^-1 H_i`` (N, n, n) of increments; a pooled filter has all of them."""
-    observations, n = increment_observations(scenario), scenario.plant.n
-    distinct = {
-        id(observation): observation for observation in observations
-    }  # nodes with equal sensors share one
-    information = {
-        key: observation.H.T @ np.linalg.solve(observation.R, observation.H)
-        if len(observation.H)
-        else np.zeros((n, n))
-        for key, observation in distinct.items()
-    }
-    informations = [information[id(observation)] for observation in observations]
+    observations = increment_observations(scenario)
+    informations = [o.H.T @ np.linalg.solve(o.R, o.H) for o in observations]
     if scenario.filter.algorithm.timing.pooled:
         informations = informations * len(scenario.nodes)
     return np.stack(informations)

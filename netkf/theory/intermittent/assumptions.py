@@ -71,14 +71,8 @@ def _arrival_rows(scenario: Scenario) -> list[AssumptionRow]:
     if lacks_channel_law(scenario):
         # A recording has no probabilities: the assumption is neither true nor false.
         holds, evidence = None, no_channel_law(scenario)
-    rows: list[AssumptionRow] = [
-        (
-            "arrivals are independent of each other and of the past, and not impossible",
-            "R (12), Theorem 9",
-            holds,
-            evidence,
-        )
-    ]
+    name = "arrivals are independent of each other and of the past, and not impossible"
+    rows: list[AssumptionRow] = [(name, "R (12), Theorem 9", holds, evidence)]
     if any(sensor.varying for sensor in scenario.sensors):
         return rows
     if channel.independent and len(finite_rates) == len(rates):
@@ -96,12 +90,8 @@ def _bounded_mean_row(scenario: Scenario) -> AssumptionRow:
             continue
         heard = [(i, j) for i, j in scenario.topology.directions if j == node and i in sensing]
         if len(heard) > MAX_HEARD:
-            return (
-                BOUNDED_MEAN,
-                "R (32)",
-                None,
-                f"not decided: node {node} hears {len(heard)} sensors",
-            )
+            evidence = f"not decided: node {node} hears {len(heard)} sensors"
+            return (BOUNDED_MEAN, "R (32)", None, evidence)
         radius = contraction_radius(F, _arrival_sets(scenario, own_H, heard))
         if least_sufficient is None or radius > least_sufficient[0]:
             least_sufficient = radius, node, _deliveries(scenario, heard)
