@@ -14,12 +14,7 @@ from netkf.algorithms.kernels.chains import trace_paths
 from netkf.checks.equations import error_promises
 from netkf.checks.evidence import COMPUTED, Assumption, Finding, Promise
 from netkf.checks.exact import check_nees, summarise_exactly
-from netkf.checks.laws import (
-    FIXED_READINGS,
-    LAW_TOLERANCE,
-    find_largest,
-    fixed_readings,
-)
+from netkf.checks.laws import FIXED_READINGS, LAW_TOLERANCE, find_largest, fixed_readings
 from netkf.checks.mode_sequences import (
     FAR_START,
     MIN_CHAINS,
@@ -417,10 +412,7 @@ PROMISES = (
     ),
     Promise("readings arrive with the stated probability", "R (12)", FRESH, _check_arrival_counts),
     Promise(
-        "the law of P is that of independent arrivals, at every time",
-        "R (18)",
-        FIXED,
-        check_law,
+        "the law of P is that of independent arrivals, at every time", "R (18)", FIXED, check_law
     ),
     Promise(
         "P is stochastically bounded: its law does not grow any more",

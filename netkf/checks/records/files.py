@@ -130,10 +130,7 @@ def _summary_fault(run: Run, stored: StoredRun) -> str:
     if list(rows) != list(run.nodes):
         return "summary.json: its nodes are not those of the run"
     for node in run.nodes:
-        for name, value in (
-            ("sent", senders[node]),
-            ("transmissions", transmissions.get(node, 0)),
-        ):
+        for name, value in (("sent", senders[node]), ("transmissions", transmissions.get(node, 0))):
             if rows[node].get(name) != value:
                 return f"summary.json: {name} of node {node} {rows[node].get(name)}, not {value}"
     return _averages_fault(run, summary, rows) if run.status == "complete" else ""

@@ -8,11 +8,7 @@ from netkf.network.losses import NoLoss
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import AssumptionRow
 from netkf.theory.common.plant_assumptions import slot_plant_rows, start_rows
-from netkf.theory.gossip.matchings import (
-    detecting_walk,
-    mean_swaps,
-    period_of,
-)
+from netkf.theory.gossip.matchings import detecting_walk, mean_swaps, period_of
 
 MAX_LISTED = 12  # matchings that a row names
 

@@ -394,13 +394,7 @@ def support(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike, depth: int) 
 
 
 def invariant_samples(
-    F: ArrayLike,
-    Q: ArrayLike,
-    H: ArrayLike,
-    R: ArrayLike,
-    delivery: float,
-    samples: int,
-    seed: int,
+    F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike, delivery: float, samples: int, seed: int
 ) -> FloatArray:
     """Return independent draws (samples, n, n) from the invariant law of the random Riccati
     equation, to which the one-step prediction covariance tends.
