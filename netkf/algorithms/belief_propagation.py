@@ -345,6 +345,18 @@ def shift(record: Any, h: int, run: Any) -> None:
     set_growing(record, run.lanes, record.centre[h], record.base[h])
 
 
+@kernel
+def shift_payload(record: Any, m: int, run: Any) -> None:
+    """Move the centre in payload ``m``, as a state and, which may have been rounded, as an e."""
+    lanes, centre = run.lanes, record.payload.centre
+    shift_vector(run, record.payload.xhat, m)
+    for i in range(record.growing):
+        total = load(lanes, centre, m, i)
+        for j in range(len(run.size)):
+            total += record.inverse[i, j] * load(lanes, run.offset, j)
+        store(lanes, centre, m, i, total)
+
+
 def belief_propagation_record(
     filtering: BeliefPropagation, infos: Sequence[NodeInfo], models: Sequence[Any]
 ) -> Record:
@@ -427,6 +439,7 @@ class BeliefPropagation(Filter):
         emit=emit,
         absorb=absorb,
         shift=shift,
+        shift_payload=shift_payload,
         addressed=True,
         record=belief_propagation_record,
         begin=begin_belief_propagation,

@@ -424,3 +424,59 @@ def test_what_is_drawn_does_not_depend_on_who_hears(scenario_of, tmp_path):
     netkf.export_recorded(run, tmp_path / "twin")
     twin = netkf.simulate(netkf.load(tmp_path / "twin" / "scenario.toml"), engine="simpy")
     np.testing.assert_array_equal(twin.xhat, run.xhat)
+
+
+FLOW = """import numpy as np
+
+F = np.array([[0.9, 0.1], [0.0, 0.8]])
+
+
+class Flow:
+    def f(self, x, u, t):
+        return F @ x + u[0]
+
+    def jacobian(self, x, u, t):
+        return F
+"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "keys"),
+    [
+        ("belief-propagation", {"steps": 2}),
+        ("hcmci", {"steps": 2}),
+        ("gossip", {}),
+        ("track-fusion", {"rule": "ci"}),
+    ],
+)
+def test_beside_an_input_all_numbers_are_those_of_absolute_states(
+    tmp_path, monkeypatch, kind, keys
+):
+    """As those of the same plant written as one that is not linear, where nothing is counted from
+    the response to the input.
+    """
+    (tmp_path / "flows.py").write_text(FLOW)
+    monkeypatch.syspath_prepend(tmp_path)
+    law = {"Q": [[0.2, 0.0], [0.0, 0.1]], "period": 1.0, "cov": [[1.0, 0.0], [0.0, 1.0]]}
+    constant = {"kind": "constant", "value": [0.7]}
+    pairs = {"kind": "matching", "protocol": "maximal"}
+    table = {
+        "format": 1,
+        "name": "few",
+        "horizon": 20.0,
+        "probe": 1.0,
+        "plant": {"kind": "nonlinear", "f": "flows:Flow", **law, "input": constant},
+        "sensors": [{"nodes": [0, 2], "H": [[1.0, 0.5]], "R": [[0.3]]}],
+        "network": {
+            "graph": {"kind": "path", "nodes": 3},
+            "activation": pairs if kind == "gossip" else {"kind": "broadcast"},
+            "quantise": {"bits": 6, "range": 16.0},
+        },
+        "filter": {"kind": kind, **keys},
+    }
+    flow = from_table(table, tmp_path)
+    linear = {"kind": "linear", "F": [[0.9, 0.1], [0.0, 0.8]], **law}
+    linear["input"] = constant | {"G": [[1.0], [1.0]]}
+    run, other = (netkf.simulate(s, seed=3) for s in (flow.replace({"plant": linear}), flow))
+    np.testing.assert_allclose(run.xhat, other.xhat, atol=1e-9)
+    np.testing.assert_allclose(run.P, other.P, atol=1e-9)
