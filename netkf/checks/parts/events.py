@@ -226,12 +226,12 @@ def _directions(scenario: Scenario, messages: np.ndarray) -> IntArray:
 
 def _pairs_of_hearers(messages: np.ndarray, is_lost: np.ndarray) -> list[np.ndarray]:
     """Return the number of pairs of messages (K,) of one broadcast, and of those both lost."""
-    order = np.lexsort([messages[name] for name in ("sender", "phase", "sent")])
-    changes = [np.diff(messages[name][order]) != 0 for name in ("sent", "phase", "sender")]
-    begins = np.flatnonzero(np.append(True, np.any(changes, axis=0)) if len(order) else [])
-    sizes = np.diff(np.append(begins, len(order)))
-    gone = np.add.reduceat(is_lost[order].astype(np.int64), begins) if len(begins) else sizes
-    return [np.array(float((k * (k - 1) // 2).sum())) for k in (sizes, gone)]
+    import pandas as pd
+
+    names = ["sender", "phase", "sent"]
+    lost = pd.DataFrame({name: messages[name] for name in names} | {"lost": is_lost})
+    counts = lost.groupby(names)["lost"].agg(["size", "sum"]).to_numpy(dtype=np.int64).T
+    return [np.array(float((k * (k - 1) // 2).sum())) for k in counts]
 
 
 def _entity_indices(entities: Sequence[Entity], columns: Sequence[np.ndarray]) -> IntArray:

@@ -8,6 +8,7 @@ the numbers of messages and what becomes of each follow from the scenario.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
@@ -108,64 +109,50 @@ def _ordered_steps(log: Any) -> Iterator[str]:
         yield f"{_describe(log, int(rows[k + 1]))} comes after the end of its exchange"
 
 
-def _keys(log: Any, senders: np.ndarray, receivers: np.ndarray) -> IntArray:
-    """Return one integer (K,) for each message of K rows, by its directed link and number."""
-    size = int(max(log["node"].max(initial=0), log["peer"].max(initial=0))) + 2
-    width = int(log["message"].max(initial=0)) + 2
-    return np.asarray(((senders + 1) * size + receivers + 1) * width + log["message"] + 1)
-
-
 def _numbered(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
+    import pandas as pd
+
     links = set(scenario.topology.directions)
     for kind in (SEND, TRANSMIT):
         rows = np.flatnonzero(log["kind"] == kind)
-        node, peer = log["node"][rows], log["peer"][rows]
-        codes = (node + 1) * (int(peer.max(initial=0)) + 2) + peer + 1
-        pairs, first, index = np.unique(codes, return_index=True, return_inverse=True)
-        for row in first.tolist() if kind == SEND else ():
-            if (int(node[row]), int(peer[row])) not in links:
-                yield f"{_describe(log, int(rows[row]))} is on no link"
-        order = np.argsort(index, kind="stable")
-        counts = np.bincount(index, minlength=len(pairs))
-        expected = np.empty(len(rows), dtype=np.int64)
-        expected[order] = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+        ends = pd.DataFrame({name: log[name][rows] for name in ("node", "peer")})
+        for row in rows[~ends.duplicated()].tolist() if kind == SEND else ():
+            if (int(log["node"][row]), int(log["peer"][row])) not in links:
+                yield f"{_describe(log, row)} is on no link"
+        expected = ends.groupby(["node", "peer"]).cumcount().to_numpy()
         if (k := _first(log["message"][rows] != expected)) is not None:
             row = int(rows[k])
             yield f"{_describe(log, row)} has number {log['message'][row]}, not {expected[k]}"
 
 
 def _decided(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
-    send_rows = np.flatnonzero(log["kind"] == SEND)
-    sends = log[send_rows]
-    ends = np.flatnonzero(np.isin(log["kind"], (DELIVER, LOST, LATE)))
-    last = log[ends]
-    is_lost = last["kind"] == LOST
+    import pandas as pd
+
     # A message is sent and lost by the node of its row, but arrives there.
     arrives, node, peer = np.isin(log["kind"], (DELIVER, LATE)), log["node"], log["peer"]
-    links = np.where(arrives, peer, node), np.where(arrives, node, peer)
-    every, keys = (_keys(log, *links)[rows] for rows in (send_rows, ends))
-    order = np.argsort(every, kind="stable")
-    place = np.searchsorted(every[order], keys)
-    known = place < len(every)
-    known[known] = every[order][place[known]] == keys[known]
-    if (k := _first(~known)) is not None:
-        yield f"{_describe(log, int(ends[k]))} is of message {last['message'][k]}, never sent"
+    table = pd.DataFrame({"row": np.arange(len(log)), "message": log["message"]})
+    table["sender"], table["receiver"] = np.where(arrives, (peer, node), (node, peer))
+    sends = table[log["kind"] == SEND]
+    ends, keys = table[arrives | (log["kind"] == LOST)], ["sender", "receiver", "message"]
+    joined = ends.merge(sends, on=keys, how="left", suffixes=("", "_sent"))
+    rows, last = ends["row"].to_numpy(), log[ends["row"]]
+    if (k := _first(joined["row_sent"].isna().to_numpy())) is not None:
+        yield f"{_describe(log, int(rows[k]))} is of message {last['message'][k]}, never sent"
         return
-    sent = sends[order[place]]
-    repeats = np.ones(len(keys), dtype=bool)
-    repeats[np.unique(keys, return_index=True)[1]] = False
-    if (k := _first(repeats)) is not None:
-        yield f"{_describe(log, int(ends[k]))} is a second end of message {last['message'][k]}"
-    if (k := _first(ends < send_rows[order[place]])) is not None:
-        yield f"{_describe(log, int(ends[k]))} comes before message {last['message'][k]} is sent"
+    places = joined["row_sent"].to_numpy(dtype=np.int64)
+    sent, is_lost = log[places], last["kind"] == LOST
+    if (k := _first(ends.duplicated(keys).to_numpy())) is not None:
+        yield f"{_describe(log, int(rows[k]))} is a second end of message {last['message'][k]}"
+    if (k := _first(rows < places)) is not None:
+        yield f"{_describe(log, int(rows[k]))} comes before message {last['message'][k]} is sent"
     age = np.where(is_lost, 0.0, last["age"])
     taken = scenario.time_grid.snap(last["t"] - sent["t"])
     if (k := _first(~(taken == age) | (last["phase"] != sent["phase"]))) is not None:
         yield (
-            f"{_describe(log, int(ends[k]))} is {taken[k]:.9g} s after its "
+            f"{_describe(log, int(rows[k]))} is {taken[k]:.9g} s after its "
             f"message was sent in phase {sent['phase'][k]}, not {age[k]:.9g} s"
         )
-    waiting = sends["t"][~np.isin(every, keys)]
+    waiting = log["t"][np.setdiff1d(sends["row"], places)]
     longest = scenario.longest_delay
     limit = scenario.horizon * (1.0 - TIME_TOLERANCE)
     if run.status == "complete" and (waiting + longest < limit).any():
@@ -176,6 +163,8 @@ def _decided(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
 
 
 def _absorbed(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
+    import pandas as pd
+
     kinds = log["kind"]
     if scenario.slotted and scenario.node_filter.timing.pairwise:
         swaps, arrivals = (np.flatnonzero(kinds == kind) for kind in (SWAP, DELIVER))
@@ -186,21 +175,15 @@ def _absorbed(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
             yield f"{len(swaps):,} swaps for {len(arrivals):,} messages delivered in pairs"
         return
     step = np.cumsum(kinds == ROUND) if scenario.slotted else log["t"]
-    rows = [np.flatnonzero(kinds == kind) for kind in (DELIVER, ABSORB)]
-    steps, nodes = np.unique(step), np.unique(log["node"])
-    # One integer for each step and node.
-    places, size = np.searchsorted(nodes, log["node"]), len(nodes)
-    codes = [np.searchsorted(steps, step[part]) * size + places[part] for part in rows]
-    reached, (absorbed, counts) = np.unique(codes[0]), np.unique(codes[1], return_counts=True)
-    if (k := _first(counts > 1)) is not None:
-        yield f"node {nodes[absorbed[k] % size]} absorbs {counts[k]} times in one exchange"
-    missing = np.setdiff1d(reached, absorbed, assume_unique=True)
-    extra = np.setdiff1d(absorbed, reached, assume_unique=True)
-    if len(missing) and run.status == "complete":
-        node, at = nodes[missing[0] % size], steps[missing[0] // size]
+    table = pd.DataFrame({"step": step, "node": log["node"]})
+    reached, absorbed = (
+        table[kinds == kind].value_counts(sort=False).sort_index() for kind in (DELIVER, ABSORB)
+    )
+    for (_, node), count in absorbed[absorbed > 1].items():
+        yield f"node {node} absorbs {count} times in one exchange"
+    for at, node in reached.index.difference(absorbed.index) if run.status == "complete" else ():
         yield f"node {node} never absorbs what reaches it at {at:.9g}"
-    if len(extra):
-        node, at = nodes[extra[0] % size], steps[extra[0] // size]
+    for at, node in absorbed.index.difference(reached.index):
         yield f"node {node} absorbs what never reached it at {at:.9g}"
 
 
@@ -283,9 +266,7 @@ def _caused(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
         fits = forth | (back & (cause["t"] == sent["t"]) & (clock.at == "links"))
     if (k := _first(~fits)) is not None:
         yield f"{_describe(log, int(sends[k]))} follows no tick of its sender"
-    receivers = dict.fromkeys(scenario.nodes, 0)
-    for sender, _ in scenario.topology.directions:
-        receivers[sender] += 1
+    receivers = Counter(sender for sender, _ in scenario.topology.directions)
     if by_link:
         both = clock.at == "links" and not scenario.topology.directed
         expected = np.full(len(causes), 2 if both else 1)
