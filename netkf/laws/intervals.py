@@ -173,15 +173,11 @@ def probability_interval(successes: int, trials: int, level: float) -> Interval:
     if trials:
         low, high = limits(successes / trials, 1.0)
         # Half a success and half a failure are added: a fraction of 0 or 1 has a variance too.
-        detectable = _binomial_shift((successes + 0.5) / (trials + 1.0), trials, level)
+        p = (successes + 0.5) / (trials + 1.0)
+        # Of the rarer outcome: q rises where p > 1/2 falls.
+        rises = [_binomial_rise(q, trials, level) for q in (p, 1.0 - p)]
+        detectable = float(np.fmax.reduce(rises))
     return Interval(successes / max(trials, 1), low, high, detectable, again=limits)
-
-
-def _binomial_shift(p: float, trials: int, level: float) -> float:
-    # Of the rarer outcome: q rises where p > 1/2 falls.
-    up = _binomial_rise(p, trials, level), _binomial_rise(1.0 - p, trials, level)
-    possible = [shift for shift in up if math.isfinite(shift)]
-    return max(possible, default=math.nan)
 
 
 def _binomial_rise(p: float, trials: int, level: float) -> float:

@@ -32,7 +32,7 @@ from netkf.theory.common.evidence import (
 )
 from netkf.theory.common.observations import increment_observations
 from netkf.theory.hybrid import dense
-from netkf.theory.hybrid.dense import FullMatrix, SparseOrFull, full_matrix, solve_or_nan
+from netkf.theory.hybrid.dense import FullMatrix, SparseOrFull, full_matrix, matrix_of, solve_or_nan
 from netkf.theory.hybrid.samples import (
     PoissonSamples,
     SampleJump,
@@ -172,17 +172,10 @@ def coupling(scenario: Scenario) -> SparseOrFull:
     rates = {} if transmits_at_samples(scenario) else scenario.effective_rates()
     # Losses thin the Poisson process of arrivals: the effective rate counts what arrives.
     heard = {pair: rate for pair, rate in rates.items() if rate > 0.0}
-    values = np.array([rate * scenario.weight(i, j) for (j, i), rate in heard.items()])
-    indices = np.array([(index[i], index[j]) for j, i in heard], dtype=np.int64).reshape(-1, 2)
+    values = [rate * scenario.weight(i, j) for (j, i), rate in heard.items()]
+    places = [index[i] for _, i in heard], [index[j] for j, _ in heard]
     n = scenario.plant.n
-    if size * n * (n + 1) // 2 <= dense.MAX_UNKNOWNS:
-        full = full_matrix(size, size)
-        full[indices[:, 0], indices[:, 1]] = values
-        return full
-    entries = scipy.sparse.coo_array((values, (indices[:, 0], indices[:, 1])), shape=(size, size))
-    matrix = scipy.sparse.csr_array(entries)
-    matrix.eliminate_zeros()
-    return matrix
+    return matrix_of(values, places, size, size * n * (n + 1) // 2 <= dense.MAX_UNKNOWNS)
 
 
 def coupled_riccati(scenario: Scenario) -> CoupledRiccati:

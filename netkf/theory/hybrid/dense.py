@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import scipy
 
 from netkf.linalg.arrays import FloatArray
 
@@ -29,6 +30,17 @@ class FullMatrix(np.ndarray):
     def toarray(self) -> FloatArray:
         """Return the matrix as an ordinary array."""
         return np.asarray(self)
+
+
+def matrix_of(values: Any, places: Any, size: int, full: bool) -> SparseOrFull:
+    """Return a matrix (size, size) of ``values`` at ``places`` (rows, columns), 0 elsewhere."""
+    if not full:
+        sparse = scipy.sparse.csr_array((values, places), shape=(size, size), dtype=float)
+        sparse.eliminate_zeros()
+        return sparse
+    matrix = full_matrix(size, size)
+    matrix[places] = values
+    return matrix
 
 
 def full_matrix(rows: int, columns: int) -> FullMatrix:

@@ -20,7 +20,7 @@ from netkf.rng.streams import Streams
 from netkf.scenario.model import PlacedSensor
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.observations import Observation, timed_observations
-from netkf.theory.hybrid.dense import FullMatrix, SparseOrFull, full_matrix
+from netkf.theory.hybrid.dense import FullMatrix, SparseOrFull, full_matrix, matrix_of
 
 MAX_FULL = 100  # nodes up to which weights are a full matrix
 
@@ -112,11 +112,7 @@ def _mean_link_weights(scenario: Scenario) -> SparseOrFull:
     ways = scenario.topology.directions if talks and transmits_at_samples(scenario) else ()
     values = [scenario.mean_delivery((i, j)) * scenario.weight(j, i) for i, j in ways]
     places = [index[j] for _, j in ways], [index[i] for i, _ in ways]
-    if len(index) > MAX_FULL:
-        return scipy.sparse.csr_array((values, places), shape=(len(index), len(index)), dtype=float)
-    weights = full_matrix(len(index), len(index))
-    weights[places] = values
-    return weights
+    return matrix_of(values, places, len(index), full=len(index) <= MAX_FULL)
 
 
 def poisson_samples(scenario: Scenario) -> tuple[PoissonSamples, ...]:
