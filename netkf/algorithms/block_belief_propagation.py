@@ -27,6 +27,7 @@ from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, PairRea
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.rows import Rows, pair_rows, stacked, updated
 from netkf.algorithms.traits import Analysis, Needs, Timing
+from netkf.core.errors import ScenarioError
 from netkf.core.fields import field, integer
 from netkf.core.places import Place
 from netkf.linalg.arrays import FloatArray, square_root, symmetric
@@ -128,6 +129,18 @@ def note_loops(scenario: Any) -> tuple[str, ...]:
     return () if is_forest(scenario) else (f"block-belief-propagation: {rule}",)
 
 
+def refuse_moving_bits(scenario: Any) -> None:
+    """Raise ScenarioError where few bits would say states that are counted from a response."""
+    if scenario.network.quantise and scenario.plant.linear and scenario.knows_input:
+        raise ScenarioError(
+            "network.quantise",
+            "cannot stand beside an input that the block-belief-propagation filter knows: its "
+            "messages are of states at several times",
+            scenario.network.quantise.bits,
+            "remove it",
+        )
+
+
 @built_in("block-belief-propagation")
 @dataclass(frozen=True, eq=False)
 class BlockBeliefPropagation(Filter):
@@ -148,7 +161,14 @@ class BlockBeliefPropagation(Filter):
     steps: int = field(integer(low=1, high=MAX_STEPS), default=1)
     window: int = field(integer(low=1, high=MAX_WINDOW), default=10)
 
-    needs = Needs(one_way=True, samples=True, blocks=True, own_blocks=True, notes=note_loops)
+    needs = Needs(
+        one_way=True,
+        samples=True,
+        blocks=True,
+        own_blocks=True,
+        check=refuse_moving_bits,
+        notes=note_loops,
+    )
 
     @property
     def timing(self) -> Timing:

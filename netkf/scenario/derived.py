@@ -856,8 +856,7 @@ class DerivedScenario(ScenarioModel):
         if responses is None or responses.believed is None:
             return mean, cov
         origin = responses.believed.states(np.array([when]))[0]
-        views = self.model_views
-        return mean - (origin if views is None else origin[views[self.topology.index[node]]]), cov
+        return mean - origin[self.model_view(self.topology.index[node])], cov
 
     def prior_shift(self, node: int, when: float) -> FloatArray:
         """Return by how much the mean of ``fresh_estimate`` at ``when`` differs from that at 0."""

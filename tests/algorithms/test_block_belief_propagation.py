@@ -12,6 +12,7 @@ import pytest
 
 import netkf
 from netkf.algorithms.block_belief_propagation import BlockBeliefPropagation
+from netkf.core.errors import ScenarioError
 from netkf.scenario.reading import from_table
 from netkf.trace.schema import KINDS
 from tests.algorithms.test_block_intersection import BELIEF, CLOCKED, ROBOTS, load
@@ -230,3 +231,12 @@ def test_bearings_of_nodes_that_are_nearly_at_one_place(tmp_path: Path) -> None:
     run = netkf.simulate(from_table(table, tmp_path))
     assert run.status == "complete"
     assert np.linalg.eigvalsh(run.P).min() > -1e-12
+
+
+def test_few_bits_of_states_at_several_times_are_not_counted_from_an_input(tmp_path: Path) -> None:
+    driven = ROBOTS.replace("F = ", 'input = {kind = "constant", G = [[1.0]], value = [0.3]}\nF = ')
+    few: dict[str, Any] = {"network__quantise": {"bits": 8, "range": 20.0}}
+    belief = BELIEF | {"estimates": "own"}
+    load(ROBOTS, tmp_path, filter=belief, **few)
+    with pytest.raises(ScenarioError, match=r"quantise: cannot stand beside an input .* got 8"):
+        load(driven, tmp_path, filter=belief, **few)
