@@ -89,18 +89,9 @@ def run_size(options: argparse.Namespace) -> int:
     key, low, high = parse_interval(options.vary[0])
     scenario = load_scenario(options)
     with ProgressLine() as line:
-        sizing = size(
-            scenario,
-            key,
-            low,
-            high,
-            options.target,
-            options.by,
-            options.runs,
-            options.confidence,
-            **pool_settings(options),
-            progress=line.replace,
-        )
+        how = options.target, options.by, options.runs, options.confidence
+        settings = {**pool_settings(options), "progress": line.replace}
+        sizing = size(scenario, key, low, high, *how, **settings)
     print_table_notes(scenario)
     if options.json:
         probes = [probe._asdict() for probe in sorted(sizing.probes)]
@@ -132,14 +123,9 @@ def _compare_filters(options: argparse.Namespace) -> int:
     filters = parse_values("--filters", "filters", options.filters)
     scenario = load_scenario(options)
     with ProgressLine() as line:
-        comparison = compare_filters(
-            scenario,
-            filters,
-            options.runs,
-            confidence=options.confidence,
-            **pool_settings(options),
-            progress=line.make_count_update("filters"),
-        )
+        settings = {**pool_settings(options), "progress": line.make_count_update("filters")}
+        settings["confidence"] = options.confidence
+        comparison = compare_filters(scenario, filters, options.runs, **settings)
     print_table_notes(scenario)
     print_notes([f"{row.filter}: {row.status}" for row in comparison.rows if not row.ran])
     try:

@@ -71,14 +71,9 @@ def read_ulb(log: Path) -> PacketLog:
     spread_equal(sends, find_resolution(read_stamps), notes)
     sends = sends.sort_values("t", kind="stable").reset_index(drop=True)
     outcomes = _outcomes(sends, kept, notes)
-    result = PacketLog(
-        sends[["sender", "t", "channel", "to", "sent", "logged"]],
-        outcomes,
-        origin,
-        find_resolution([*stamps, *read_stamps]),
-        "unknown",
-        notes,
-    )
+    sends = sends[["sender", "t", "channel", "to", "sent", "logged"]]
+    resolution = find_resolution([*stamps, *read_stamps])
+    result = PacketLog(sends, outcomes, origin, resolution, "unknown", notes)
     result.readings = readings
     places = find_extra(log, "positions")
     if places is not None:
