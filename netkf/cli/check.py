@@ -72,16 +72,10 @@ def _run_check(scenario: Scenario, options: argparse.Namespace, earlier: Verdict
     from netkf.checks.check import MAX_LOOKED_RUNS, check
 
     with _explain_interrupt(options, earlier), ProgressLine() as line:
-        return check(
-            scenario,
-            options.runs,
-            confidence=options.confidence,
-            **pool_settings(options),
-            progress=line.make_count_update("runs"),
-            until=options.until,
-            most=options.most or MAX_LOOKED_RUNS,
-            earlier=earlier,
-        )
+        settings = {**pool_settings(options), "progress": line.make_count_update("runs")}
+        settings |= {name: getattr(options, name) for name in ("confidence", "until")}
+        most = options.most or MAX_LOOKED_RUNS
+        return check(scenario, options.runs, **settings, most=most, earlier=earlier)
 
 
 @contextlib.contextmanager
@@ -95,8 +89,7 @@ def _explain_interrupt(options: argparse.Namespace, earlier: Verdict | None) -> 
         content = "nothing was written"
         if earlier:
             content = f"{options.out} has the verdict on {earlier.runs:,} runs"
-        message = f"new runs are kept with their verdict only; {content}"
-        raise KeyboardInterrupt(message) from None
+        raise KeyboardInterrupt(f"new runs are kept with their verdict only; {content}") from None
 
 
 def _open_verdict_directory(scenario: Scenario, options: argparse.Namespace) -> Verdict | None:

@@ -85,8 +85,7 @@ def load_scenario(
         return load(copy, trust=options.trust)
     seed = getattr(options, "seed", None)
     settings = options.set if seed is None else [*options.set, f"seed={seed}"]
-    changes = {**parse_changes(settings), **ignored}
-    loaded = load(options.scenario, changes, trust=options.trust)
+    loaded = load(options.scenario, {**parse_changes(settings), **ignored}, trust=options.trust)
     options.loaded = loaded
     return loaded
 

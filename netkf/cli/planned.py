@@ -125,8 +125,7 @@ def run_work(options: argparse.Namespace) -> int:
     if plan.arguments:
         return work_on_study(plan, part, pool, options)
     with ProgressLine() as line:
-        update = line.make_count_update("runs")
-        done = work_on_plan(plan, part, options.seconds, pool, update)
+        done = work_on_plan(plan, part, options.seconds, pool, line.make_count_update("runs"))
     print_notes(plan.scenario.notes)
     which = f"part {part.index}/{part.count}" if part.count > 1 else "all"
     if not done.simulated and not done.left:
@@ -293,8 +292,7 @@ def _merge_again(options: argparse.Namespace, plan: Plan) -> int | None:
                 copy_file(new / name, folder / name)
     print(notes.getvalue(), end="", file=sys.stderr)
     done = f"nothing left to do in {folder}" if not missing else f"written to {folder}"
-    said = text.getvalue().replace(f"written to {new}", done)
-    print(said.replace(str(new), str(folder)), end="")
+    print(text.getvalue().replace(f"written to {new}", done).replace(str(new), str(folder)), end="")
     return status
 
 

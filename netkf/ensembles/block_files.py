@@ -223,9 +223,7 @@ class BlockFiles(ABC):
         self._own.add(node)
 
     def load(self, node: Node) -> Any:
-        """Return the result of the block of a node; raises EngineError if it was damaged
-        meanwhile.
-        """
+        """Return the result of a node's block; raises EngineError if it was damaged meanwhile."""
         with self._expect_block(node), open_block(self._path(node)) as arrays:
             return self.unpack(arrays)
 
@@ -312,8 +310,7 @@ def verify(file: Path) -> None:
     with reading_file(file), file.open("rb") as opened:
         length = max(0, opened.seek(0, os.SEEK_END) - SEAL_BYTES)
         opened.seek(length)
-        seal = opened.read()
-        if seal != MARK + digest_of(opened, length):
+        if opened.read() != MARK + digest_of(opened, length):
             raise DamagedError("was changed since it was written")
 
 

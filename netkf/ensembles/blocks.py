@@ -66,9 +66,7 @@ class Job(NamedTuple):
 
 
 class BlockResult(NamedTuple):
-    """What the task of a block returned, and the CPU time in seconds that it took without compiling
-    (which is slow but happens once).
-    """
+    """What a block's task returned, and its CPU time in seconds without that of compiling."""
 
     value: Any
     seconds: float

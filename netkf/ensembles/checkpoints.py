@@ -46,9 +46,7 @@ class BlockCheckpoints(BlockFiles):
         return value._replace(traces=())
 
     def load(self, node: Node) -> RunStatistics:
-        """Return the block of a node without its traces; raises EngineError if it was damaged
-        meanwhile.
-        """
+        """Return a node's block, without traces; raises EngineError if it was damaged meanwhile."""
         with self._expect_block(node), open_block(self._path(node)) as arrays:
             return _restore_statistics(arrays)
 
@@ -78,9 +76,7 @@ class BlockCheckpoints(BlockFiles):
         return _restore_statistics(arrays)._replace(traces=traces)
 
     def require_fit(self, arrays: Any, stored: dict[str, Any]) -> int:
-        """Return the number of runs; raises DamagedError unless their statistics have the form and
-        the numbers that they should.
-        """
+        """Return the number of runs; raises DamagedError unless form and numbers are right."""
         value = _restore_statistics(arrays)
         if not self._has_form(value):
             raise DamagedError("does not fit the scenario")

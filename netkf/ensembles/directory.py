@@ -230,8 +230,7 @@ class DirectoryWriter:
     def note(self, status: str = "interrupted", error: BaseException | None = None) -> None:
         """Write status and progress to the manifest, unless the final manifest is written."""
         if not self._ended:
-            tasks = {"tasks": self._tasks} if self._tasks else {}
-            entries = self._identity_entries(**tasks)
+            entries = self._identity_entries(**{"tasks": self._tasks} if self._tasks else {})
             self._manifest.write(status, entries, self._done, error)
             self._last_note = time.monotonic()
 

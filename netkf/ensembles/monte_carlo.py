@@ -134,15 +134,10 @@ def monte_carlo(
     require_scenario(scenario, "monte_carlo", ", runs")
     chosen = choose_engine(engine, scenario)
     seed, count = scenario.seed if seed is None else seed, require_runs(runs)
+    task, asked = partial(block_statistics, engine=chosen), (scenario, count, seed)
+    pool, together = PoolOptions(workers, executor, scheduler), chosen.together(scenario)
     statistics = replicate_blocks(
-        partial(block_statistics, engine=chosen),
-        merge,
-        scenario,
-        count,
-        seed,
-        pool=PoolOptions(workers, executor, scheduler),
-        progress=progress,
-        together=chosen.together(scenario),
+        task, merge, *asked, pool=pool, progress=progress, together=together
     )
     return ensemble_of(scenario, statistics, seed, chosen.name)
 
@@ -161,7 +156,8 @@ def ensemble_of(scenario: Scenario, statistics: RunStatistics, seed: int, engine
     for errors in (mean_error, mean_nees, se_error, se_nees):
         errors[scenario.times >= statistics.rounding_from] = np.nan
     # Numbers of messages in all runs, from their means over runs.
-    totals = statistics.messages.mean[0] * statistics.messages.size
+    totals = (statistics.messages.mean[0] * statistics.messages.size).tolist()
+    counts = dict(zip(MESSAGES, totals, strict=True))
     return Ensemble(
         times=scenario.times,
         nodes=scenario.nodes,
@@ -174,11 +170,7 @@ def ensemble_of(scenario: Scenario, statistics: RunStatistics, seed: int, engine
         se_nees=se_nees,
         average=statistics.averages.mean.reshape(-1, 3),
         se_average=statistics.averages.standard_error().reshape(-1, 3),
-        messages={
-            name: round(total)
-            for name, total in zip(MESSAGES, totals.tolist(), strict=True)
-            if np.isfinite(total)
-        },
+        messages={name: round(count) for name, count in counts.items() if np.isfinite(count)},
         diverged=int(statistics.totals[1]),
         events=int(statistics.totals[0]),
         seed=seed,
@@ -198,9 +190,7 @@ def _unpack_samples(values: FloatArray, n: int) -> tuple[FloatArray, FloatArray,
 
 
 def ensemble_table(ensemble: Ensemble) -> dict[str, np.ndarray]:
-    """Return the columns (T N,) of ensemble.parquet by name, a row for each time and node; without
-    ground truth those of P alone.
-    """
+    """Return the columns (T N,) of ensemble.parquet by name; without truth those of P alone."""
     n, rows = ensemble.mean_P.shape[-1], len(ensemble.times) * len(ensemble.nodes)
     i, j = np.triu_indices(n)
 

@@ -70,15 +70,12 @@ class PlannedStudy:
 
     @contextlib.contextmanager
     def store(self, job: Job, merge: Merge, form: Form) -> Iterator[BlockStore]:
-        """Yield the store of the next ensemble; raises MissingRunsError if results are missing in
-        the end, or are not returned.
-        """
+        """Yield the store of the next ensemble; raises MissingRunsError if results are missing."""
         assert isinstance(job.scenario, Scenario)
         self._count += 1
         digest = scenario_digest(job.scenario)
         identity = RunIdentity(digest, job.seed, job.stop, "none", "", job.first)
-        folder = self._directory / BLOCKS_FOLDER / f"{self._count:04d}"
-        blocks = StudyBlocks(folder, merge, form)
+        blocks = StudyBlocks(self._directory / BLOCKS_FOLDER / f"{self._count:04d}", merge, form)
         with self.worker.store(blocks, identity, self._returns) as store:
             yield store
         self.installations += [i for i in blocks.installations if i not in self.installations]

@@ -168,8 +168,7 @@ def work_on_plan(
         ):
             replicate_blocks(task, merge, scenario, identity.runs, pool=workers, store=store)
     except KeyboardInterrupt:
-        remedy = f"; go on with {plan.work_command}"
-        raise InterruptedRunError(plan.directory, remedy) from None
+        raise InterruptedRunError(plan.directory, f"; go on with {plan.work_command}") from None
     return WorkDone(replicas, worker.simulated, worker.left)
 
 

@@ -74,8 +74,7 @@ def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
     runs, count, filters, n = batch.error.shape
     kept = batch.lengths - batch.diverged
     P, error = np.ascontiguousarray(batch.P), np.ascontiguousarray(batch.error)
-    exact = batch.exact_errors
-    rounding_from = blurred_from(batch.times, batch.x, P, error, batch.lengths, exact)
+    rounding_from = blurred_from(batch.times, batch.x, P, error, batch.lengths, batch.exact_errors)
     # States that a node does not estimate: error 0 and variance 1 for the NEES, 0 for averages.
     whole_error, whole_P = without_padding(error, P)
     of_nees = whole_error.reshape(runs, -1, n), whole_P.reshape(runs, -1, n, n)
@@ -145,9 +144,7 @@ def reduce_samples(size: Size, s: ReducedSamples, bounds: np.ndarray) -> None:
 
 @kernel
 def fill_node(size: Size, s: ReducedSamples, r: int, t: int, count: int, node: int) -> None:
-    """Make ``count`` samples from number ``t`` on of run ``r`` the moments of a ``node``, zero
-    where the run lacks them.
-    """
+    """Set moments of a ``node`` to ``count`` samples from ``t`` on of run ``r``, else zero."""
     n, filters = len(size), s.averages.shape[1]
     P, error, nees, mean, M2 = s.P[r], s.error[r], s.nees[r], s.node_mean[node], s.node_M2[node]
     # Column by column, so that neighbouring samples are neighbours in memory.

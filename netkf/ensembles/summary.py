@@ -82,9 +82,7 @@ def _chi_square(scenario: Scenario, statistics: RunStatistics) -> dict[str, floa
 
 
 def mean_bounds(scenario: Scenario, promised: PromisedTraces) -> FloatArray | None:
-    """Return the averages (N + 1,) of the promised bound over the samples after time 0, of each
-    node and of all; None without a bound.
-    """
+    """Return averages (N + 1,) of the promised bound after time 0, last of all nodes; or None."""
     if promised.bound is None:
         return None
     after_start = promised.bound[scenario.times > 0.0]

@@ -111,9 +111,7 @@ class _RemoteError(Exception):
 
 
 class ProcessPool(RemotePool):
-    """Own worker processes, started as blocks need them, each with one BLAS thread and without the
-    user's script as __main__.
-    """
+    """Own worker processes, each with one BLAS thread and without the user's script as __main__."""
 
     def __init__(self, workers: int) -> None:
         super().__init__()

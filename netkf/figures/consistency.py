@@ -113,8 +113,7 @@ def draw_nis(axes: Any, innovations: Innovations) -> tuple[float, float]:
     axes.set(ylabel="NIS / rows of a reading", xlabel=SECONDS)
     draw_legend(axes)
     low, high = chi_square_interval(rows, CONFIDENCE)
-    share = float(((nis / rows >= low) & (nis / rows <= high)).mean())
-    return share, float(nis.sum() / rows.sum())
+    return float(((nis / rows >= low) & (nis / rows <= high)).mean()), float(nis.sum() / rows.sum())
 
 
 def whiteness_figure(data: FigureData) -> Picture:

@@ -126,8 +126,7 @@ def quantiles_figure(data: FigureData) -> Picture:
     axes.fill_between(times, q05, q95, color=RELAY, alpha=0.3, lw=0, label="90% of nodes")
     axes.fill_between(times, q25, q75, color=RELAY, alpha=0.6, lw=0, label="50% of nodes")
     axes.plot(times, median, color=INK, lw=1.6, label="median node")
-    largest = np.nanmax(values, axis=1)
-    axes.plot(times, largest, color=SENSING, ls="--", lw=1.1, label="worst node")
+    axes.plot(times, np.nanmax(values, axis=1), color=SENSING, ls="--", lw=1.1, label="worst node")
     name = "error" if data.shows_errors else "root of trace P"
     headline = _mark_worst(axes, data, times, values, name)
     set_scale(axes, values)

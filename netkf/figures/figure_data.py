@@ -203,8 +203,7 @@ def reduce_result(result: Any) -> FigureData:
         raise ScenarioError("", "plot needs to know the scenario", result, SIMULATE)
     if isinstance(result, Run):
         return _reduce_run(result)
-    promised = promise_traces(result.scenario, result.times)
-    return reduce_ensemble(result.scenario, result, promised)
+    return reduce_ensemble(result.scenario, result, promise_traces(result.scenario, result.times))
 
 
 def _reduce_run(run: Run) -> FigureData:

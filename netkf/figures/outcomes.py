@@ -101,8 +101,7 @@ def _draw_matrix(
                 dark = 0.3 * red + 0.59 * green + 0.11 * blue < 0.5
                 style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 6.5}
                 axes.text(j, i, f"{value:.2f}", color="white" if dark else INK, **style)
-    bar = figure.colorbar(image, ax=axes, shrink=0.85, label=label)
-    bar.outline.set_linewidth(0.5)
+    figure.colorbar(image, ax=axes, shrink=0.85, label=label).outline.set_linewidth(0.5)
     return axes, figure
 
 

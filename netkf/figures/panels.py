@@ -70,8 +70,7 @@ def draw_nodes(axes: Any, data: FigureData, values: FloatArray, se: FloatArray |
             label = f"nodes {description}"
         axes.plot([], [], color=colour, lw=1.4, label=label)  # for the legend
     if len(data.times) == 1:  # a line of one sample is invisible
-        count = len(data.nodes)
-        axes.plot(np.repeat(data.times, count), values.ravel(), ".", color=INK, ms=4)
+        axes.plot(np.repeat(data.times, len(data.nodes)), values.ravel(), ".", color=INK, ms=4)
     axes.autoscale()
 
 
@@ -92,8 +91,7 @@ def draw_errors(axes: Any, data: FigureData, bound: bool = False) -> None:
             draw_message(axes, NO_TRUTH)
             return
         draw_nodes(axes, data, data.first_component, se=None)
-        label = f"estimate of {label_text(data.scenario.state_labels[0])}"
-        axes.set(ylabel=label, xlabel=SECONDS)
+        axes.set(ylabel=f"estimate of {label_text(data.scenario.state_labels[0])}", xlabel=SECONDS)
         shade_downtimes(axes, data)
         draw_legend(axes)
         return

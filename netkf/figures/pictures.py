@@ -42,8 +42,7 @@ def overview(data: FigureData) -> Picture:
         drawings, heights = [*drawings, draw_nees], [1.0, 1.0]
     grid = figure.add_gridspec(2, 2, height_ratios=heights)
     lower = [grid[1, 0], grid[1, 1]] if data.shows_errors else [grid[1, :]]
-    cells = [grid[0, 0], grid[0, 1], *lower]
-    *panels, network = (figure.add_subplot(cell) for cell in cells)
+    *panels, network = (figure.add_subplot(cell) for cell in [grid[0, 0], grid[0, 1], *lower])
     for axes, draw in zip(panels, drawings, strict=True):
         if len(data.times):
             draw(axes, data)

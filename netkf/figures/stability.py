@@ -182,8 +182,7 @@ def _draw_sweep_map(axes: Any, table: Any, keys: list[str], unit: str) -> None:
         diverged[cell] = "diverged" in str(point["status"])
         unbounded[cell] = not np.isfinite(point["bound"])
     positive = errors[np.isfinite(errors) & (errors > 0.0)]
-    is_log = positive.size and positive.max() > LOG_RATIO * positive.min()
-    norm = "log" if is_log else "linear"
+    norm = "log" if positive.size and positive.max() > LOG_RATIO * positive.min() else "linear"
     image = axes.imshow(errors, aspect="auto", origin="lower", cmap=SEQUENTIAL, norm=norm)
     for group, marker, label in ((diverged, "x", "runs diverged"), (unbounded, "o", "no bound")):
         rows, columns = np.nonzero(group)
@@ -240,8 +239,7 @@ def law_figure(data: FigureData) -> Picture:
     if data.runs > 1:
         raise UnavailableError("The law of P is that of single runs, and these are means of many.")
     # The first samples still depend on P(0).
-    after_start = data.times >= START_SHARE * data.times[-1]
-    traces = data.trace[after_start]
+    traces = data.trace[data.times >= START_SHARE * data.times[-1]]
     traces = np.where(traces < MAX_DRAWN, traces, np.nan)
     if not np.isfinite(traces).any():
         raise UnavailableError(f"All traces of P are above {MAX_DRAWN:g} or not finite.")

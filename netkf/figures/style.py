@@ -165,8 +165,7 @@ def write_figure(figure: Figure, path: Path) -> None:
             # ``savefig`` would first draw all artists to nowhere.
             canvas: Any = FigureCanvasAgg(figure)
             # Level 6 takes longer, for a file that is one or two percent smaller.
-            options = {"compress_level": 2}
-            canvas.print_png(temporary, metadata=metadata, pil_kwargs=options)
+            canvas.print_png(temporary, metadata=metadata, pil_kwargs={"compress_level": 2})
         else:
             figure.savefig(temporary, dpi=RESOLUTION, format=file_format, metadata=metadata)
 
@@ -201,8 +200,7 @@ def _legend_columns(labels: Sequence[str], width: float) -> int:
 
 def draw_message(axes: Any, message: str) -> None:
     """Draw a message, broken into lines, in place of the axes of a panel."""
-    width = 0.9 * _axes_width(axes)
-    text = break_lines(message, width, 9.0)
+    text = break_lines(message, 0.9 * _axes_width(axes), 9.0)
     axes.text(0.02, 0.5, text, color=MUTED, va="center", transform=axes.transAxes)
     axes.axis("off")
 
@@ -225,5 +223,4 @@ def set_scale(axes: Any, values: FloatArray, levels: Sequence[float] = ()) -> No
         axes.set_yscale("log")
     elif positive.size:
         # With the bands that are drawn, unless they are so wide that curves would be flat.
-        top = np.clip(axes.dataLim.y1, positive.max(), 1.5 * positive.max())
-        axes.set_ylim(0.0, 1.06 * top)
+        axes.set_ylim(0.0, 1.06 * np.clip(axes.dataLim.y1, positive.max(), 1.5 * positive.max()))

@@ -78,5 +78,4 @@ def _draw_row(axes: Any, height: int, row: Evidence) -> None:
     style = {"marker": marker, "color": colour, "ms": 4.5, "mec": INK, "mew": 0.5}
     axes.plot([min(row.off / unit, FURTHEST)], [height], **style)
     if np.isfinite(row.detectable):
-        detectable = min(row.detectable / unit, FURTHEST)
-        axes.plot([detectable], [height], "|", color=INK, ms=9)
+        axes.plot([min(row.detectable / unit, FURTHEST)], [height], "|", color=INK, ms=9)

@@ -217,8 +217,7 @@ def law_run(
     scenario: Scenario, seed: int, replica: int, law: FittedLaw, delay: dict[str, Any]
 ) -> dict[str, float]:
     """Return the quantities of one run of a law with parameters drawn from their posterior."""
-    random = np.random.default_rng([STREAM, seed, replica])
-    values = law.draw(random)
+    values = law.draw(np.random.default_rng([STREAM, seed, replica]))
     if delay:
         scenario = scenario.replace({"network.channel.delay": delay})
     with TemporaryDirectory() as folder:

@@ -122,8 +122,7 @@ def _lives(scenario: Scenario, run: Run, network: dict[str, Any]) -> Files:
             name = f"lives_{memory}.csv"
             lines = (f"{stamp(t)},{i},{w}\n" for t, i, w in sorted(rows))
             files[name] = "t,node,what\n" + "".join(lines)
-            entry = {"kind": "recorded", "nodes": list(own), "path": name, "memory": memory}
-            entries.append(entry)
+            entries.append({"kind": "recorded", "nodes": list(own), "path": name, "memory": memory})
     network["lives"] = entries
     return files
 
@@ -174,6 +173,7 @@ def export_log(run: Run, out: str | Path) -> tuple[Path, ...]:
     outcome = messages["outcome"]
     arrivals = np.where(outcome == UNDER_WAY, np.inf, messages["ended"])
     never = (outcome == LOST) & (messages["ended"] == messages["sent"])
+    at = zip(never, arrivals.tolist(), strict=True)
     table = pd.DataFrame(
         {
             "t": messages["sent"],
@@ -181,9 +181,7 @@ def export_log(run: Run, out: str | Path) -> tuple[Path, ...]:
             "receiver": [names[i] for i in messages["receiver"].tolist()],
             "number": messages["number"],
             "heard": (outcome != LOST).astype(int),
-            "t_heard": [
-                "" if lost else repr(t) for lost, t in zip(never, arrivals.tolist(), strict=True)
-            ],
+            "t_heard": ["" if lost else repr(t) for lost, t in at],
         }
     )
     source = f"{EXPORTED}seed {run.seed}, replica {run.replica}, engine {run.engine}\n"
@@ -198,7 +196,6 @@ def export_log(run: Run, out: str | Path) -> tuple[Path, ...]:
             ticks["peer"] = [names[i] for i in rows["peer"].tolist()]
         files["ticks.csv"] = ticks.to_csv(index=False)
     files |= {source.name: source.full for source in source_files(scenario)}
-    resolved = resolve_defaults(scenario)
-    files["scenario.toml"] = to_toml({**resolved, "seed": run.seed})
+    files["scenario.toml"] = to_toml({**resolve_defaults(scenario), "seed": run.seed})
     write_folder(folder, files)
     return tuple(folder / name for name in files)

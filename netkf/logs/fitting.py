@@ -330,24 +330,15 @@ def _direction_test(outcomes: LogOutcomes, counts: FloatArray, slack: float) -> 
     if not both:
         return {}
     order = np.array(both).T.ravel()
-    pairs = counts[order].reshape(2, -1, 2)
-    together = pairs.sum(axis=0)
+    together = counts[order].reshape(2, -1, 2).sum(axis=0)
     expected = np.tile(together[:, 1] / np.maximum(together[:, 0], 1.0), 2)
     spread = np.full(len(order), slack)
     return {"directions": stats.test_identical(counts[order], expected, spread, len(both))}
 
 
 def _test_table(tests: Mapping[str, Test], level: float) -> pd.DataFrame:
-    columns = [
-        "key",
-        "assumption",
-        "departure",
-        "estimate",
-        "detectable",
-        "p",
-        "verdict",
-        "made_by",
-    ]
+    columns = ["key", "assumption", "departure", "estimate", "detectable", "p", "verdict"]
+    columns.append("made_by")
     rows = []
     for key, test in tests.items():
         verdict = "rejected" if test.p < level else "not rejected"
@@ -518,8 +509,7 @@ def _hops(outcomes: LogOutcomes, numbers: Mapping[str, int], end: float) -> list
 
 def _varying_law(kind: str, counts: FloatArray, rows: list[Interval], shrink: float) -> FittedLaw:
     heard, likelihood = counts[:, 1], _likelihood(counts[:, 1], counts[:, 0])
-    values = heard / counts[:, 0]
-    return FittedLaw(kind, values, likelihood, counts / shrink, rows=tuple(rows))
+    return FittedLaw(kind, heard / counts[:, 0], likelihood, counts / shrink, rows=tuple(rows))
 
 
 def _likelihood(heard: Any, count: Any) -> float:
@@ -535,8 +525,7 @@ def _law_table(
         failed = "; ".join(ASSUMPTIONS[key] for key in needs[law.kind] if key in rejected)
         bic = len(law.values) * math.log(count) - 2.0 * law.likelihood
         rows.append((law.kind, law.describe(), law.likelihood, bic, failed))
-    columns = ["law", "parameters", "log_likelihood", "bic", "rejected_by"]
-    return pd.DataFrame(rows, columns=columns)
+    return pd.DataFrame(rows, columns=["law", "parameters", "log_likelihood", "bic", "rejected_by"])
 
 
 def _fit_delays(

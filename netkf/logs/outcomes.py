@@ -294,8 +294,7 @@ def lagged_products(outcomes: LogOutcomes, lag: int) -> tuple[FloatArray, float]
         z, known = group.residuals, np.isfinite(group.x)
         if len(z) <= lag:
             continue
-        unbroken = _unbroken(group.follows, lag)
-        both = known[lag:] & known[:-lag] & unbroken[:, None]
+        both = known[lag:] & known[:-lag] & _unbroken(group.follows, lag)[:, None]
         size = np.nan_to_num(group.mean * (1.0 - group.mean))
         # The mean is that of the same packets: products are smaller by its variance.
         lift = size / np.maximum(known.sum(axis=0), 1)
@@ -353,8 +352,7 @@ def test_memory(outcomes: LogOutcomes) -> Test:
             part += np.where(chosen, (now - a) * (first - b) + size / n, 0.0)
             scale += float((chosen.sum(axis=0) * size).sum())
         units.append(part.sum(axis=1))
-    whole = np.concatenate([*units, np.empty(0)])
-    return _z_test("correlation given the last", whole, scale)
+    return _z_test("correlation given the last", np.concatenate([*units, np.empty(0)]), scale)
 
 
 class Share(NamedTuple):
@@ -402,8 +400,7 @@ def shared_fate(outcomes: LogOutcomes, lags: int) -> tuple[Share, Test]:
     slack = long_run_sum(S, lags) / max(long_run_sum(S, 0), 1e-300) if lags else 1.0
     unit = math.sqrt(alone * max(slack, 1.0)) / scale
     p_value = 2.0 * float(norm.sf(abs(share) / unit))
-    rise = max(together / alone - 1.0, 0.0)
-    found = Test(what, share, p_value, unit, rise=rise)
+    found = Test(what, share, p_value, unit, rise=max(together / alone - 1.0, 0.0))
     return Share(share, error, 0.5 * lasting / scale), found
 
 
@@ -414,8 +411,7 @@ def shared_law(outcomes: LogOutcomes, delivery: float, share: float) -> tuple[fl
         n, k = np.isfinite(group.x).sum(axis=1), np.nansum(group.x, axis=1)
         alone = delivery**k * (1.0 - delivery) ** (n - k)
         one = np.where(k == n, delivery, 0.0) + np.where(k == 0, 1.0 - delivery, 0.0)
-        mixed = (1.0 - share) * alone + share * one
-        likelihood += float(np.log(np.maximum(mixed, 1e-300)).sum())
+        likelihood += float(np.log(np.maximum((1.0 - share) * alone + share * one, 1e-300)).sum())
         spread += float(((k - n * delivery) ** 2).sum())
     return likelihood, spread / float(outcomes.counts[:, 0].sum()) ** 2
 
@@ -462,8 +458,7 @@ def test_constancy(outcomes: LogOutcomes) -> Test:
     slow = max(float(rho[0]), 0.0)
     # Slow changes that are the share s of the variance of blocks make each correlation s.
     unit = deviation * (LAGS * blocks) ** -0.25
-    p = float(chi2.sf(statistic, LAGS))
-    return Test(what, deviation * math.sqrt(slow), p, unit, LAGS, 4)
+    return Test(what, deviation * math.sqrt(slow), float(chi2.sf(statistic, LAGS)), unit, LAGS, 4)
 
 
 def test_identical(counts: FloatArray, expected: FloatArray, spread: FloatArray, used: int) -> Test:
@@ -601,5 +596,4 @@ def fit_distance(
             break
     a, b = slopes
     jacobian = np.array([[1.0 / b, -a / b**2], [0.0, -1.0 / b**2]])
-    cov = jacobian @ np.linalg.inv(information) @ jacobian.T
-    return np.array([a / b, 1.0 / b]), spread * cov
+    return np.array([a / b, 1.0 / b]), spread * (jacobian @ np.linalg.inv(information) @ jacobian.T)

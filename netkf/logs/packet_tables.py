@@ -223,8 +223,7 @@ def _find_columns(path: Path, raw: pd.DataFrame, notes: list[str]) -> dict[str, 
     if names["node"] == "id" and names["sender"]:
         names["node"] = ""  # it counts rows
     if names["event"] and not names["sender"] and names["node"]:
-        events = raw[names["event"]].str.lower()
-        is_tx = events.isin(SENT)
+        is_tx = raw[names["event"]].str.lower().isin(SENT)
         own, other = raw[names["node"]], raw[names["peer"]] if names["peer"] else ""
         raw["sender"] = own.where(is_tx, other)
         raw["receiver"] = pd.Series(other, index=raw.index).where(is_tx, own)
@@ -283,11 +282,9 @@ def _read_outcomes(
             continue
         column = raw[names[name]].str.lower()
         groups = [column.isin(group).to_numpy() for group in words]
-        is_unknown = column.isin(UNKNOWN).to_numpy()
-        wrong = ~(groups[0] | groups[1] | groups[2] | is_unknown)
+        wrong = ~(groups[0] | groups[1] | groups[2] | column.isin(UNKNOWN).to_numpy())
         choices = "what happened (tx, rx or lost)" if name == "event" else "1 or 0"
-        rule = f"{names[name]} must say {choices}"
-        refuse_rows(path, column, wrong, rule, "correct the entry")
+        refuse_rows(path, column, wrong, f"{names[name]} must say {choices}", "correct the entry")
         heard = np.select([groups[1], groups[2]], [1.0, 0.0], np.nan)
         if name == "event":
             what[groups[0]] = "tx"
@@ -312,8 +309,7 @@ def _match(
     table["key"] = _by_stamps(table) if is_export else _number_transmissions(table, notes, log)
     # Of one transmission the sender's own stamp counts, else the first one.
     table["order"] = (table["what"] != "tx").astype(int)
-    ordered = table.sort_values(["order", "t"], kind="stable")
-    groups = ordered.groupby("key", sort=False)
+    groups = table.sort_values(["order", "t"], kind="stable").groupby("key", sort=False)
     sends = groups[["sender", "t", "channel", "to", "counter"]].first()
     sends["row"] = table.reset_index().groupby("key", sort=False)["index"].first()
     sends["sent"], sends["logged"] = True, groups["order"].min() == 0
@@ -333,8 +329,7 @@ def _match(
     sends = sends.sort_values(["t", "row"], kind="stable").reset_index(drop=True)
     place = pd.Series(sends.index, index=sends["key"])
     rows = table[table["what"] != "tx"].assign(send=lambda rows: rows["key"].map(place))
-    outcomes = _merge_rows(rows, notes, log)
-    return sends[["sender", "t", "channel", "to", "sent", "logged"]], outcomes
+    return sends[["sender", "t", "channel", "to", "sent", "logged"]], _merge_rows(rows, notes, log)
 
 
 def _counts_directions(table: pd.DataFrame) -> bool:

@@ -323,8 +323,7 @@ def settle(log: PacketLog, hole: float, unreported: str) -> pd.DataFrame:
     sends, told = log.sends, log.outcomes
     pairs = told.assign(sender=sends["sender"].to_numpy()[told["send"]])
     pairs = pairs[["sender", "receiver"]].drop_duplicates()
-    base = sends[["sender", "to"]].rename_axis("send").reset_index()
-    whole = base.merge(pairs, on="sender")
+    whole = sends[["sender", "to"]].rename_axis("send").reset_index().merge(pairs, on="sender")
     whole = whole[(whole["to"] == "") | (whole["to"] == whole["receiver"])]
     whole = whole.merge(told.assign(told=True), on=["send", "receiver"], how="left")
     if log.absent == "unsent":

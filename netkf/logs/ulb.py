@@ -35,8 +35,7 @@ def read_ulb(log: Path) -> PacketLog:
     """Return the packet log of a folder with readings.csv and heard.csv; raises ScenarioError."""
     paths = {}
     for name in ("readings", "heard"):
-        found = [log / f"{name}.csv", log / f"{name}.csv.gz"]
-        path = next((p for p in found if p.is_file()), None)
+        path = next((p for p in [log / f"{name}.csv", log / f"{name}.csv.gz"] if p.is_file()), None)
         if path is None:
             rule = "must be a folder with readings.csv and heard.csv or heard.csv.gz"
             raise ScenarioError(str(log), rule, None, "check the path")

@@ -61,8 +61,7 @@ def describe_source(
     if source.kind == "ensemble":
         sentences += [*_describe_ensemble(source), *_describe_bound(source)]
         if source.run is not None:
-            replica = source.run.replica
-            sentences.append(describe_replica(replica, source.runs, source.replicas))
+            sentences.append(describe_replica(source.run.replica, source.runs, source.replicas))
     elif source.run is not None and len(source.run.times):
         sentences += _describe_worst_node(source, source.run, messages)
         if isinstance(readings, Innovations):

@@ -63,6 +63,5 @@ def _write(result: Run | Ensemble, directory: Path) -> Path:
         return save(result, result.scenario, directory)
     assert result.scenario is not None
     scenario = result.scenario.replace({"seed": result.seed})
-    options = EnsembleOptions(result.engine)
-    runs_to_directory(scenario, int(result.runs.max()), directory, options)
+    runs_to_directory(scenario, int(result.runs.max()), directory, EnsembleOptions(result.engine))
     return directory

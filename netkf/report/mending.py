@@ -85,8 +85,7 @@ def describe_central(source: ReportSource, explanation: Why) -> str | None:
         return None
     filtering = dataclasses.replace(run.scenario.filter, algorithm=Central())
     try:
-        scenario = with_filter(run.scenario, filtering)
-        central_run = simulate(scenario, run.seed, run.replica, "simpy")
+        central_run = simulate(with_filter(run.scenario, filtering), run.seed, run.replica, "simpy")
     except NetkfError:
         return None
     row = int(np.searchsorted(run.times, source.worst.explained.time))
@@ -148,10 +147,8 @@ def mending_section(source: ReportSource, explanation: Why | str) -> str:
         )
         for k, what_if in enumerate(explanation.what_ifs)
     ]
-    caption = (
-        f"Node {explanation.node} at {explanation.at:.10g} s, replayed with messages that did not "
-        "arrive"
-    )
+    at = f"Node {explanation.node} at {explanation.at:.10g} s"
+    caption = f"{at}, replayed with messages that did not arrive"
     replays = table_box(caption, ("replayed with", "messages", "trace P", "change", "error"), rows)
     command = _why_command(source, source.worst.explained)
     note = f"All numbers are from replays of the run, none is estimated. For more: {command}"

@@ -174,8 +174,7 @@ def _merge_verdict(entries: list[_AnalysedSource]) -> list[_AnalysedSource]:
     kinds = [entry.source.kind for entry in entries]
     if len(entries) == 2 and kinds[1] == "verdict" and kinds[0] in ("run", "ensemble"):
         first, verdict = entries
-        source = replace(first.source, verdict=verdict.source.verdict)
-        return [first._replace(source=source)]
+        return [first._replace(source=replace(first.source, verdict=verdict.source.verdict))]
     if len(entries) == 2 and not {*kinds} <= {"run", "ensemble"}:
         rule = "compares runs and ensembles, and takes a verdict only after its run"
         raise ScenarioError("report", rule, " and ".join(kinds), "give one directory for each page")
@@ -350,13 +349,11 @@ def _result_tables(source: ReportSource) -> str:
     elif source.kind != "verdict":
         parts.append(tables.summary_section(source))
         if source.verdict is None:
-            parts.append(
-                paragraph(
-                    "There is no verdict yet. netkf check SCENARIO --out VERDICT tests the "
-                    "promises of the paper on many runs; netkf report DIR VERDICT shows both.",
-                    "note",
-                )
+            advice = (
+                "There is no verdict yet. netkf check SCENARIO --out VERDICT tests the promises "
             )
+            advice += "of the paper on many runs; netkf report DIR VERDICT shows both."
+            parts.append(paragraph(advice, "note"))
     return "".join(parts)
 
 
@@ -370,8 +367,7 @@ def _describe_origin(sources: list[ReportSource], command: str, rules: list[str]
             run = source.run
             counts = [f"{run.count(kind):,} {kind}" for kind in KINDS if run.count(kind)]
             by_kind = f" ({', '.join(counts)})" if counts else ""
-            events = f"Events of replica {run.replica}: {len(run.log):,}{by_kind}"
-            parts.append(paragraph(events))
+            parts.append(paragraph(f"Events of replica {run.replica}: {len(run.log):,}{by_kind}"))
     if rules:
         parts.append(bullets(f"Left out: {rule}." for rule in rules))
     elif any(source.run is not None for source in sources):

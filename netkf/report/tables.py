@@ -332,6 +332,5 @@ def sweep_curves(source: ReportSource) -> dict[str, Any] | None:
         label = ", ".join(f"{key} = {value}" for key, value in settings)
         mean, error = rows["worst_rms"].to_numpy(), rows["worst_rms_se"].to_numpy()
         x = rows[first_key].astype(float).tolist()
-        y = _interval_curves(mean, error)
-        series.append({"label": label or "worst node", "x": x, "y": y})
+        series.append({"label": label or "worst node", "x": x, "y": _interval_curves(mean, error)})
     return {"key": first_key, "series": series}

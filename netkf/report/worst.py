@@ -86,8 +86,7 @@ def find_worst_samples(run: StoredRun, summary: Mapping[str, Any]) -> WorstSampl
     if not last < START_UP_RATIO * first or not len(low) or run.times[low[0]] <= worst.time:
         return WorstSamples(worst, worst, None)
     later = rows[rows >= low[0]]
-    explained = worst_of(later) if len(later) else worst
-    return WorstSamples(worst, explained, StartUp(first, now, last))
+    return WorstSamples(worst, worst_of(later) if len(later) else worst, StartUp(first, now, last))
 
 
 def summary_samples(run: StoredRun, summary: Mapping[str, Any]) -> SampleIndices:

@@ -83,8 +83,7 @@ def fate_matrix(outcomes: Outcomes, size: int) -> FloatArray:
     """Return the correlation of outcomes of hearers i and j of a broadcast, (N, N), about the means
     of links; nan on the diagonal and where unknown.
     """
-    mean = delivery_matrix(outcomes, size)
-    gap = outcomes.heard - mean[outcomes.sender, outcomes.receiver]
+    gap = outcomes.heard - delivery_matrix(outcomes, size)[outcomes.sender, outcomes.receiver]
     order = np.lexsort((outcomes.receiver, outcomes.phase, outcomes.sent, outcomes.sender))
     sender, sent, phase = (a[order] for a in (outcomes.sender, outcomes.sent, outcomes.phase))
     again = (np.diff(sender) == 0) & (np.diff(sent) == 0) & (np.diff(phase) == 0)

@@ -153,8 +153,7 @@ class ParquetSink(Sink):
         # A row group at a time: in large networks a slot has millions of rows.
         for first in range(0, max(1, len(rows)), ROW_GROUP_ROWS):
             part = rows[first : first + ROW_GROUP_ROWS]
-            columns = event_columns(part, self._replica, self._event_count, _kinds)
-            self._events.collect(columns)
+            self._events.collect(event_columns(part, self._replica, self._event_count, _kinds))
             self._event_count += len(part)
 
     def states(

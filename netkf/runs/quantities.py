@@ -122,8 +122,7 @@ class NetworkSink(Sink):
         transmissions: Transmissions | None = None,
     ) -> None:
         self._scenario = scenario
-        lives = lifetimes(scenario, Streams(seed, replica))
-        self.connectivity = ConnectivitySink(scenario, lives)
+        self.connectivity = ConnectivitySink(scenario, lifetimes(scenario, Streams(seed, replica)))
         self._counts_own = transmissions is None
         self._transmissions = transmissions or Transmissions()
         self._ages = _make_ages(scenario)

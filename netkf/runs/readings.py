@@ -197,12 +197,10 @@ def held_out_errors(run: Run) -> list[dict[str, Any]]:
 
 def errors_of_replica(scenario: Scenario, seed: int, replica: int) -> list[dict[str, Any]]:
     """Return ``held_out_errors`` of a ``replica`` of the runs of ``seed``."""
-    held = scenario.held_out_sensors
-    got = collect_readings(scenario, seed, replica, held, simulated=True)
+    got = collect_readings(scenario, seed, replica, scenario.held_out_sensors, simulated=True)
     sums: dict[int, list[FloatArray]] = {}
     for node, e, S, R in _errors(scenario, got) if got.run is not None else ():
-        known = np.isfinite(S).all()
-        nis = float(e @ np.linalg.solve(S, e)) if known else math.nan
+        nis = float(e @ np.linalg.solve(S, e)) if np.isfinite(S).all() else math.nan
         terms = [len(e), e @ e, np.trace(R), np.trace(S), nis, e.sum()]
         sums.setdefault(node, []).append(np.array(terms))
     names = ("mean_square", "noise", "expected", "nis", "bias")

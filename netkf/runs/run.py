@@ -102,10 +102,8 @@ def run_to_directory(
     is_complete = False
     try:
         start, compiled_before = time.perf_counter(), compiling.seconds_spent()
-        streams = Streams(scenario.seed, replica)
-        status = chosen_engine.run(scenario, streams, recorder, progress)
-        compile_seconds = compiling.seconds_spent() - compiled_before
-        seconds = time.perf_counter() - start - compile_seconds
+        status = chosen_engine.run(scenario, Streams(scenario.seed, replica), recorder, progress)
+        seconds = time.perf_counter() - start - (compiling.seconds_spent() - compiled_before)
         is_complete = status == "complete"
         output.close_tables()
         promised = promise_traces(scenario, np.array(output.samples.times))
@@ -247,8 +245,7 @@ def _keep_partial_results(
         with contextlib.suppress(Exception):  # a full disk fails again, and ``error`` says so
             finish()
     if not (output.directory / "summary.json").exists():
-        reason = f"not computed: the run {ENDINGS[status]}"
-        unknown = PromisedTraces(None, np.nan, np.nan, reason)
+        unknown = PromisedTraces(None, np.nan, np.nan, f"not computed: the run {ENDINGS[status]}")
         with contextlib.suppress(OSError):
             output.write_summary(unknown, recorder.count, recorder.sums, status)
     totals = _event_totals(recorder.total, str(output.fingerprint), recorder.stats)

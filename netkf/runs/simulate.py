@@ -102,8 +102,7 @@ def collect_run(
     count, width = len(scenario.nodes), scenario.width
     shapes = (), (scenario.plant.n,), (count, width), (count, width, width), (count, width)
     # Concatenated with empty arrays, the arrays of a run without samples have the right shapes.
-    empty = tuple(np.empty((0, *shape)) for shape in shapes)
-    columns = zip(empty, *memory.samples, strict=True)
+    columns = zip(tuple(np.empty((0, *shape)) for shape in shapes), *memory.samples, strict=True)
     times, x, xhat, P, error = (np.concatenate(column) for column in columns)
     return Run(
         times=times,

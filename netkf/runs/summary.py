@@ -234,8 +234,7 @@ def _average_rows(
     chosen = indices.errors if truth_known else indices.covariances
     squares = np.array(sink.sq_error if truth_known else sink.trace)
     squares = squares.reshape(-1, len(scenario.nodes))[chosen]
-    values = sample_quantities(scenario, squares)
-    quantities = quantity_rows(sample_names(scenario), values)
+    quantities = quantity_rows(sample_names(scenario), sample_quantities(scenario, squares))
     rows = [a | b for a, b in zip(rows, quantities, strict=True)]
     if len(chosen):
         at = np.array(sink.times)[chosen][squares.argmax(axis=0)]

@@ -164,8 +164,7 @@ def _name_of(sensor: Any, layout: Layout) -> str | None:
 def _for_block(sensor: Any, place: Place, nodes: tuple[int, ...], layout: Layout) -> Any:
     """Return a sensor of a block as one of the stacked state, on ``nodes`` alone."""
     if isinstance(sensor, PositionedSensor):
-        largest = max(*sensor.states, sensor.heading or 0)
-        if largest >= place.n:
+        if max(*sensor.states, sensor.heading or 0) >= place.n:
             rule = f"must be components of block {place.name!r}, which has {place.n}"
             raise ScenarioError("states", rule, list(sensor.states), "they count from 0")
         sensor.check_state(place.n)

@@ -206,15 +206,10 @@ def _check_speed(scenario: DerivedScenario) -> None:
     A = max(true, key=growth_rate)
     plant_rate = max(float(np.abs(M).sum(axis=0).max()) for M in (*true, *(M for M, _ in believed)))
     if (plant_rate + filter_rate) * longest > MAX_CONSTANTS:
-        raise ScenarioError(
-            "plant.A",
-            f"must have at most {MAX_CONSTANTS:g} time constants, or its filters must, within the "
-            f"horizon or delay of {longest:g} s",
-            A,
-            "shorten them, or choose another unit of time",
-        )
-    growth = growth_rate(A) * scenario.horizon
-    if growth > MAX_GROWTH:
+        rule = f"must have at most {MAX_CONSTANTS:g} time constants, or its filters must, within "
+        rule += f"the horizon or delay of {longest:g} s"
+        raise ScenarioError("plant.A", rule, A, "shorten them, or choose another unit of time")
+    if growth_rate(A) * scenario.horizon > MAX_GROWTH:
         rule = f"must grow by at most e^{MAX_GROWTH:g} up to the horizon"
         raise ScenarioError("plant.A", rule, A, "shorten the horizon")
 
@@ -365,8 +360,7 @@ def _check_network(scenario: DerivedScenario) -> None:
     elif topology.directed and not node_filter.needs.one_way:
         rule = f"must be false for the {name}, whose links work both ways in slots"
         raise ScenarioError("network.graph.directed", rule, True, "give an undirected graph")
-    one_way = node_filter.needs.one_way or topology.directed
-    if len(topology.components) > 1 and not one_way:
+    if len(topology.components) > 1 and not (node_filter.needs.one_way or topology.directed):
         smallest_component = sorted(topology.components[-1])
         raise ScenarioError(
             "network.graph",
@@ -424,14 +418,11 @@ def _check_filter(scenario: DerivedScenario) -> None:
             raise ScenarioError(f"filter.model.{name}", rule, value, remedy)
         require_shape(f"filter.model.{name}", value, (n, None if name == "B" else n), why)
     if scenario.tells_models and algorithm.kernels is not None:
-        raise ScenarioError(
-            "filter.kind",
-            "must define shift beside its other methods, since the plant has an input and the "
-            "filter predicts by kernels, which do not know it",
-            type(algorithm).__name__,
-            "write shift = Filter.shift if its estimates move with the state, or "
-            "filter.model.input = false",
-        )
+        rule = "must define shift beside its other methods, since the plant has an input and the "
+        rule += "filter predicts by kernels, which do not know it"
+        remedy = "write shift = Filter.shift if its estimates move with the state, or "
+        remedy += "filter.model.input = false"
+        raise ScenarioError("filter.kind", rule, type(algorithm).__name__, remedy)
     _check_believed_noise(scenario)
     check_weights(scenario)
     _check_degrees(scenario)
@@ -493,13 +484,10 @@ def _check_sensing_period(scenario: DerivedScenario) -> None:
         rule = "is too long for the readings of the most precise node"
         remedy = f"give at most {longest:.3g}, or leave it out"
         raise ScenarioError("plant.sensing_period", rule, period, remedy)
-    raise ScenarioError(
-        "filter.model",
-        f"is too far from the truth: it needs readings every {longest:.3g} s, the sensors give "
-        f"one every {period:.3g} s",
-        None,
-        f"set plant.sensing_period to at most {longest:.3g}",
-    )
+    needed = f"readings every {longest:.3g} s, the sensors give one every {period:.3g} s"
+    rule = f"is too far from the truth: it needs {needed}"
+    remedy = f"set plant.sensing_period to at most {longest:.3g}"
+    raise ScenarioError("filter.model", rule, None, remedy)
 
 
 def _check_slots(scenario: DerivedScenario) -> None:

@@ -164,13 +164,8 @@ class DerivedScenario(ScenarioModel):
     def estimated_pieces(self) -> tuple[tuple[tuple[FloatArray, FloatArray], ...], ...]:
         """The ``believed_pieces`` of what each node estimates; once if all estimate all."""
         nodes = range(1 if self.views is None else len(self.nodes))
-        return tuple(
-            tuple(
-                (self.estimated_part(k, F), self.estimated_part(k, Q))
-                for F, Q in self.believed_pieces
-            )
-            for k in nodes
-        )
+        of, pieces = self.estimated_part, self.believed_pieces
+        return tuple(tuple((of(k, F), of(k, Q)) for F, Q in pieces) for k in nodes)
 
     def estimated_part(self, k: int, M: FloatArray) -> FloatArray:
         """Return the rows and columns (n', n') of M (n, n) that node number ``k`` estimates."""
@@ -782,8 +777,7 @@ class DerivedScenario(ScenarioModel):
     def _moves_readings(self, sensor: Sensor) -> Response | None:
         """Return the response that readings of the sensor depend on; None if on local states."""
         responses = self.input_responses
-        drawn = sensor.linear and sensor.is_random and sensor.fault is None
-        if responses is None or drawn:
+        if responses is None or (sensor.linear and sensor.is_random and sensor.fault is None):
             return None
         return responses.believed
 

@@ -764,8 +764,7 @@ class ScenarioModel(Component):
             for phase in (phases if self.slotted else (-1,))
         )
         # The central filter sends nothing.
-        largest = max(sizes, default=0)
-        return longest + radio.seconds(largest)
+        return longest + radio.seconds(max(sizes, default=0))
 
     def mean_delivery(self, link: Link) -> float:
         """Return the share of messages of a link that arrive in the long run; nan if unknown."""

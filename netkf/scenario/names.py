@@ -31,8 +31,7 @@ def bind_names(part: Any, names: Names | None) -> Any:
             return value if is_read else dataclasses.replace(value, node_ids=ids, unknown={})
         rule = field.metadata.get("rule")
         # A word that stands for nodes, as "neighbours", is no name.
-        is_word = isinstance(value, str) and value == field.default
-        if rule is None or not rule.of_nodes or is_word:
+        if rule is None or not rule.of_nodes or (isinstance(value, str) and value == field.default):
             return _bind_couplings(rebuild(value, change), names)
         # Nodes that were taken from a table are taken again, when it is read again.
         codes = set(getattr(getattr(owner, "path", None), "unknown", {}).values())

@@ -44,13 +44,10 @@ def check_preconditions(scenario: DerivedScenario) -> None:
     if not scenario.slotted:
         _check_increments(scenario)
     if needs.linear_plant and not scenario.plant.linear:
-        raise ScenarioError(
-            "filter.kind",
-            f"must be a filter that uses dynamics in predictions only; the {filter_name(scenario)} "
-            "computes with F",
-            kind_name(scenario.filter.algorithm),
-            f"use a linear plant, or {ANOTHER}",
-        )
+        rule = "must be a filter that uses dynamics in predictions only; "
+        rule += f"the {filter_name(scenario)} computes with F"
+        kind, remedy = kind_name(scenario.filter.algorithm), f"use a linear plant, or {ANOTHER}"
+        raise ScenarioError("filter.kind", rule, kind, remedy)
     if needs.fixed_sensors:
         _check_fixed_sensors(scenario)
     if needs.every_reading and scenario.slotted:
@@ -195,13 +192,11 @@ def _check_fixed_sensors(scenario: DerivedScenario) -> None:
         if sensor.varying:
             irregular = sensor.linear and sensor.record is not None
             varies = "H or R varies, or a value is missing" if irregular else "H varies"
-            raise ScenarioError(
-                scenario.sensor_key(k),
-                f"must have a fixed H for the {filter_name(scenario)}, which computes with it "
-                "before there are readings",
-                f"kind {kind_name(sensor, 'sensor')!r}, whose {varies}",
-                f"use linear sensors, or {ANOTHER}",
-            )
+            rule = f"must have a fixed H for the {filter_name(scenario)}, which computes with it "
+            rule += "before there are readings"
+            value = f"kind {kind_name(sensor, 'sensor')!r}, whose {varies}"
+            remedy = f"use linear sensors, or {ANOTHER}"
+            raise ScenarioError(scenario.sensor_key(k), rule, value, remedy)
 
 
 def _check_every_reading(scenario: DerivedScenario) -> None:
@@ -265,13 +260,9 @@ def _check_invertible(scenario: DerivedScenario) -> None:
             least = float(np.linalg.eigvalsh(initial[singular])[0])
             value = f"a singular one at node {singular} (least eigenvalue {least:.3g})"
         noise = "a positive definite Q" if scenario.slotted else "a B that drives every state"
-        raise ScenarioError(
-            "filter.cov",
-            f"must be positive definite for the {filter_name(scenario)}, which inverts "
-            "covariances, where the noise does not drive every state",
-            value,
-            f"give filter.cov, or {noise}",
-        )
+        rule = f"must be positive definite for the {filter_name(scenario)}, which inverts "
+        rule += "covariances, where the noise does not drive every state"
+        raise ScenarioError("filter.cov", rule, value, f"give filter.cov, or {noise}")
 
 
 def _check_ways(scenario: DerivedScenario) -> None:
@@ -289,13 +280,10 @@ def _check_ways(scenario: DerivedScenario) -> None:
         )
         missed = np.setdiff1d(np.arange(N), reached)
         if missed.size:
-            raise ScenarioError(
-                "network.graph",
-                f"must lead from every node to every other for the {filter_name(scenario)}, whose "
-                "sums otherwise gather at some nodes",
-                text.format(scenario.nodes[0], scenario.nodes[missed[0]]),
-                f"add edges, or {ANOTHER}",
-            )
+            rule = f"must lead from every node to every other for the {filter_name(scenario)}, "
+            rule += "whose sums otherwise gather at some nodes"
+            value = text.format(scenario.nodes[0], scenario.nodes[missed[0]])
+            raise ScenarioError("network.graph", rule, value, f"add edges, or {ANOTHER}")
 
 
 def _check_heard(scenario: DerivedScenario) -> None:
@@ -303,13 +291,10 @@ def _check_heard(scenario: DerivedScenario) -> None:
     for k, sensor in enumerate(scenario.sensors):
         for node in sensor.nodes:
             if node not in heard:
-                raise ScenarioError(
-                    f"{scenario.sensor_key(k)}.nodes",
-                    f"must be nodes that others hear for the {filter_name(scenario)}, whose nodes "
-                    "use only the readings that they send",
-                    node,
-                    f"add a link from it, or {ANOTHER}",
-                )
+                rule = f"must be nodes that others hear for the {filter_name(scenario)}, whose "
+                rule += "nodes use only the readings that they send"
+                key, remedy = f"{scenario.sensor_key(k)}.nodes", f"add a link from it, or {ANOTHER}"
+                raise ScenarioError(key, rule, node, remedy)
 
 
 SAMPLING = 'sampling = { kind = "periodic", period = ... }'

@@ -91,8 +91,7 @@ def sample_rate(scenario: ScenarioModel, node: int) -> float:
     placed_sensors = scenario.sampled_sensors.get(node, ())
     if len(placed_sensors) != 1:
         return math.nan if placed_sensors else 0.0
-    sensor = scenario.sensors[placed_sensors[0].entry]
-    clock = getattr(sensor, "sampling", None)
+    clock = getattr(scenario.sensors[placed_sensors[0].entry], "sampling", None)
     return math.nan if clock is None else clock.mean_rate((node, 0))
 
 

@@ -202,8 +202,7 @@ def _block_schema() -> Schema:
     own = [key for key in list_keys(Block) if key.name != "plant"]
     plants: list[type[Component]] = [Diffusion, LinearPlant, NonlinearPlant]
     names = {cls: name for name, cls in KINDS["plant"].items()}
-    variants = [_kind_schema(names[cls], cls, own, is_default=True) for cls in plants]
-    return {"anyOf": variants}
+    return {"anyOf": [_kind_schema(names[cls], cls, own, is_default=True) for cls in plants]}
 
 
 def _kind_schema(
@@ -227,8 +226,7 @@ def _time_model_rules() -> list[Schema]:
         return {"properties": {"plant": plant}, "required": ["plant"]}
 
     def limit_kinds(activations: Sequence[str], filters: Sequence[str]) -> Schema:
-        activation = {"activation": _component_schema(activations)}
-        network = {"type": "object", "properties": activation}
+        network = {"type": "object", "properties": {"activation": _component_schema(activations)}}
         return {"properties": {"network": network, "filter": _component_schema(filters)}}
 
     in_slots = {"anyOf": [plant_schema({"const": "linear"}), plant_schema(recorded, "F")]}

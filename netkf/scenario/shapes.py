@@ -50,13 +50,10 @@ def check_changes_on_grid(scenario: DerivedScenario, period: float) -> None:
     for k, change in enumerate(scenario.plant.changes.tolist()):
         nearest = scenario.time_grid.instant(round(change / period) * period)
         if change < scenario.horizon and nearest != change:
-            raise ScenarioError(
-                f"plant.schedule[{k}].from",
-                f"must be a multiple of plant.sensing_period = {period:.15g}, where sensors read "
-                "increments",
-                change,
-                f"give {nearest:.15g}, or another plant.sensing_period",
-            )
+            key, other = f"plant.schedule[{k}].from", "plant.sensing_period"
+            rule = f"must be a multiple of {other} = {period:.15g}, where sensors read increments"
+            remedy = f"give {nearest:.15g}, or another {other}"
+            raise ScenarioError(key, rule, change, remedy)
 
 
 def check_regressor(scenario: DerivedScenario, key: str, sensor: RegressorSensor) -> None:

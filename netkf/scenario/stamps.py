@@ -52,8 +52,7 @@ def _convert_origin(value: Any) -> int | float | str:
 
 
 def _origin_seconds(value: int | float | str) -> Decimal:
-    text = value if isinstance(value, str) else repr(value)
-    return TimeBase().exact(text)
+    return TimeBase().exact(value if isinstance(value, str) else repr(value))
 
 
 _origin = Rule(

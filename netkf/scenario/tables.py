@@ -159,8 +159,7 @@ def _build(cls: type[S], table: Mapping[str, Any], origin: Origin) -> Any:
     if "time" in values:
         origin = origin._replace(stamps=values["time"].stamps)
     if "plants" in values and "plant" in values:
-        rule = "cannot stand beside [[plants]]"
-        raise ScenarioError("plant", rule, None, "write one of the two")
+        raise ScenarioError("plant", "cannot stand beside [[plants]]", None, "write one of the two")
     blocks = partial(_build_list, "plants", partial(_build_block, origin))
     values = _build_inner(values, {"plant": partial(_build_plant, origin), "plants": blocks})
     plant = values.get("plant")

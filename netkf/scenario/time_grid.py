@@ -38,9 +38,7 @@ FAR = 1e3  # a tick is far below a time of so many ticks
 
 
 class TimeConstant(NamedTuple):
-    """A time in the fields of a scenario: its key path, seconds, and the rational number that it
-    stands for, None if it is not known.
-    """
+    """A time of a scenario: key path, seconds, and the rational that it stands for, if known."""
 
     key: str
     seconds: float
@@ -194,13 +192,9 @@ def check_grid(scenario: Any) -> None:
             remedy = f"give a finer resolution, at least {least:g}, or leave it out"
             raise ScenarioError(key, rule, seconds, remedy)
         if seconds > 0.0 and rounding * FAR > seconds:
-            raise ScenarioError(
-                key,
-                f"must be far above {grid.resolution:g} s, the finest resolution of time that "
-                f"leaves {MAX_TICKS:g} ticks to the horizon {scenario.horizon:.15g}",
-                seconds,
-                "lengthen it or shorten the horizon",
-            )
+            rule = f"must be far above {grid.resolution:g} s, the finest resolution of time that "
+            rule += f"leaves {MAX_TICKS:g} ticks to the horizon {scenario.horizon:.15g}"
+            raise ScenarioError(key, rule, seconds, "lengthen it or shorten the horizon")
 
 
 def grid_notes(scenario: Any) -> tuple[str, ...]:
@@ -238,7 +232,6 @@ def _short_times(scenario: Any) -> Iterator[tuple[str, float]]:
             rates = [rate for rate in (clock.rate, *(e[-1] for e in clock.rates)) if rate]
             yield "the mean gap of a clock,", 1.0 / max(rates, default=1e-15)
     if isinstance(scenario.plant, Diffusion):
-        pieces = scenario.plant.pieces
-        fastest = max(float(np.abs(eigenvalues(piece.A)).max()) for piece in pieces)
+        fastest = max(float(np.abs(eigenvalues(piece.A)).max()) for piece in scenario.plant.pieces)
         if fastest > 0.0:
             yield "the shortest time constant of the plant,", 1.0 / fastest

@@ -46,8 +46,7 @@ def parse_values(option: str, key: str, text: str) -> list[Any]:
     try:
         values = _parse_toml_value(f"[{text}]")
     except (ValueError, RecursionError):
-        items = _split_at_commas(text)
-        return [parse_value(option, key, item.strip() or " ") for item in items]
+        return [parse_value(option, key, item.strip() or " ") for item in _split_at_commas(text)]
     return list(values)
 
 

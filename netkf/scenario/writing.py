@@ -39,8 +39,7 @@ class _Style(NamedTuple):
 
 
 def _style_of(scenario: DerivedScenario, with_defaults: bool = False) -> _Style:
-    names = scenario.topology.names
-    return _Style(with_defaults, {node: name for name, node in names.items()})
+    return _Style(with_defaults, {node: name for name, node in scenario.topology.names.items()})
 
 
 def as_table(scenario: DerivedScenario) -> dict[str, Any]:

@@ -97,9 +97,7 @@ class ComparedRow(NamedTuple):
 
 
 class ComparedSetting(NamedTuple):
-    """A ``key`` of scenarios that differ in it, with its value in every directory as TOML, "-"
-    where a scenario does not have it.
-    """
+    """A differing ``key`` of scenarios, its value in each as TOML, "-" where it is not a key."""
 
     key: str
     values: tuple[str, ...]
@@ -154,8 +152,7 @@ class RunDirectory:
             truth = [name for name in names if name[:1] == "x" and name[1:].isdecimal()]
             states = read_numbers(file, ["run", "t", "node", "sq_error"])
             # A node may estimate fewer states than others, and a singular P has no NEES.
-            empty = ["nees", *traces, *truth]
-            states = states.join(read_numbers(file, empty, allow_empty=True))
+            states = states.join(read_numbers(file, ["nees", *traces, *truth], allow_empty=True))
         complete = states["run"].nunique() == self.runs
         states["mean_trace"] = states[traces].sum(axis=1, min_count=1)
         return states[states["t"] > 0.0] if complete else None
@@ -367,8 +364,7 @@ def _compare_quantity(
     degrees = min(first.runs, other.runs) - 1.0
     if sum(parts) > 0.0:
         degrees = sum(squares) ** 2 / sum(parts)
-    error = math.sqrt(sum(squares))
-    return _with_interval(entry, difference, error, degrees, level, "Welch")
+    return _with_interval(entry, difference, math.sqrt(sum(squares)), degrees, level, "Welch")
 
 
 def _with_interval(

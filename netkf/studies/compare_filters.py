@@ -251,8 +251,7 @@ class SimulatedFilter(NamedTuple):
 def _summarise(entry: FilterEntry, values: FilterValues, seed: int, engine: str) -> SimulatedFilter:
     scenario = entry.scenario
     assert scenario is not None
-    truth_known = scenario.plant.truth_known
-    curve = mean_curve(entry.label, scenario, values.curves) if truth_known else None
+    curve = mean_curve(entry.label, scenario, values.curves) if scenario.plant.truth_known else None
     traffic = count_traffic(scenario, seed, choose_engine(engine, scenario, announce=False))
     return SimulatedFilter(scenario, values._replace(curves=np.empty((0, 0))), curve, traffic)
 

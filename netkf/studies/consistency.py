@@ -180,8 +180,7 @@ def _expected_nees(P: FloatArray, sigma: FloatArray | None) -> FloatArray:
         return expected
     usable = np.asarray(np.isfinite(P).all(axis=(-2, -1)))
     usable[usable] = is_definite(P[usable])
-    scaled = np.linalg.solve(P[usable], sigma[usable])
-    expected[usable] = np.trace(scaled, axis1=-2, axis2=-1)
+    expected[usable] = np.trace(np.linalg.solve(P[usable], sigma[usable]), axis1=-2, axis2=-1)
     return expected
 
 
@@ -529,8 +528,7 @@ def _explain_bias(scenario: Scenario, conservative: bool) -> str:
         return f"the filters' model makes P {'conservative' if conservative else 'overconfident'}"
     bias = covariance_bias(scenario)
     if conservative:
-        by_design = bias == "larger"
-        return "P is conservative by design" if by_design else "P is conservative"
+        return "P is conservative by design" if bias == "larger" else "P is conservative"
     if bias == "smaller":
         return "P is overconfident by design"
     mean = scenario.filter.mean

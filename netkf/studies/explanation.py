@@ -184,10 +184,8 @@ class Why:
         return None if keys is None else [self.missing[key]._asdict() for key in keys]
 
     def __repr__(self) -> str:
-        return (
-            f"<netkf why: node {self.node} at {self.at:g} s of {self.scenario!r}, trace P "
-            f"{self.trace:.4g}>"
-        )
+        at = f"node {self.node} at {self.at:g} s"
+        return f"<netkf why: {at} of {self.scenario!r}, trace P {self.trace:.4g}>"
 
     def __str__(self) -> str:
         notes = [f"note: {note}" for note in self.notes]
@@ -199,12 +197,8 @@ class Why:
 
     def sentences(self) -> list[str]:
         """Return the explanation in sentences, one line each."""
-        return [
-            *self._state_sentences(),
-            *self._heard_sentences(),
-            *self._reading_sentences(),
-            *self._smallest_sentences(),
-        ]
+        found = *self._state_sentences(), *self._heard_sentences(), *self._reading_sentences()
+        return [*found, *self._smallest_sentences()]
 
     def _state_sentences(self) -> Iterator[str]:
         run = f"seed {self.seed}, replica {self.replica}"
@@ -345,11 +339,9 @@ class Why:
             for s in listed
         ]
         text = format_table(header, shorten_rows(rows, MAX_ROWS), left_columns=1)
-        other_text = (
-            f"\nwithout a sensor and a link to it: {count_phrase(others, 'node')}" if others else ""
-        )
+        other_text = f"\nwithout a sensor and a link to it: {count_phrase(others, 'node')}"
         ages = f"+1 .. +{budget}: age of the newest reading with so many more messages"
-        return f"{text}\ntimes in seconds; {ages}{other_text}"
+        return f"{text}\ntimes in seconds; {ages}{other_text if others else ''}"
 
     def _replay_table(self) -> str:
         truth = any(math.isfinite(w.error) for w in self.what_ifs)

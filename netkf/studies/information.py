@@ -170,8 +170,7 @@ def find_flow(
         # A message that carries only the reading of its instant comes from a segment of its own,
         # which receives no messages.
         node = np.concatenate([nodes, messages.sender])
-        index = np.searchsorted(log["t"], messages.sent, side="left")
-        start = np.concatenate([start, index])
+        start = np.concatenate([start, np.searchsorted(log["t"], messages.sent, side="left")])
         origin = np.where(readings, len(nodes) + np.arange(len(messages)), origin)
     return Flow(
         messages=messages,
@@ -280,8 +279,7 @@ class KeptReadings:
         sensed = np.flatnonzero(log["kind"] == CODES["sense"])
         self._changes: dict[int, list[tuple[int, int]]] = {}
         for row in np.flatnonzero(np.isin(log["kind"], (*SLEEPS, *WAKES))).tolist():
-            change = row, int(log["kind"][row])
-            self._changes.setdefault(int(log["node"][row]), []).append(change)
+            self._changes.setdefault(int(log["node"][row]), []).append((row, int(log["kind"][row])))
         # Sorted by node: the rows of a node are neighbours, in their order.
         nodes = log["node"][sensed]
         order = np.argsort(nodes, kind="stable")
@@ -379,5 +377,4 @@ def _age_key(reading: float, known: float) -> tuple[float, float]:
 def route(reach: BackwardSearch, segment: int, budget: int) -> tuple[int, ...]:
     """Return the ids of the nodes on the way of information of ``segment`` to the node."""
     path: Iterable[int] = reach.messages_from(segment, budget)
-    receivers = [int(reach.flow.messages.receiver[m]) for m in path]
-    return (int(reach.flow.node[segment]), *receivers)
+    return (int(reach.flow.node[segment]), *[int(reach.flow.messages.receiver[m]) for m in path])

@@ -355,8 +355,7 @@ def _bias(
         tail = level / len(components) / 2.0
         quantile = -float(ndtri(tail))
         if inflation > 1.0:  # estimated from as many independent values
-            freedom = max(len(v) / inflation - 1.0, 1.0)
-            quantile = -float(stdtrit(freedom, tail))
+            quantile = -float(stdtrit(max(len(v) / inflation - 1.0, 1.0), tail))
         reach = quantile * error
         if best[3] < 0 or abs(bias) / reach > abs(best[0]) / best[1]:
             best = bias, reach, reach + float(ndtri(POWER)) * error, c

@@ -132,8 +132,7 @@ class ClockedInnovations:
             if time not in readings or now >= len(run.times) or blurred[last]:
                 continue
             # The node predicts over the time that passed by its clock.
-            gap = clock.shows(time) - clock.shows(start)
-            (F,), (root,) = self._moves.laws(np.array([gap]))
+            (F,), (root,) = self._moves.laws(np.array([clock.shows(time) - clock.shows(start)]))
             moved, square = (x[now] - F @ x[last])[view], np.ix_(own, own)
             F, Q = F[view][:, view], (root @ root.T)[view][:, view]
             P = F @ run.P[last, i][square] @ F.T + Q

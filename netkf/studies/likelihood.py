@@ -160,8 +160,7 @@ class CentralModel:
         # The first row of each instant, and their number.
         self._first = np.searchsorted(numbers, np.arange(len(got.times) + 1))
         self._of, self._scales = np.array(of), np.array(scales)
-        columns = map(np.array, zip(*owners, strict=True))
-        _, self.times, self.nodes, self.components = columns
+        _, self.times, self.nodes, self.components = map(np.array, zip(*owners, strict=True))
 
     def _lay_laws(self, scenario: Scenario, times: FloatArray) -> None:
         parts = [v.Q for v in self.variances if v.Q is not None]
@@ -188,8 +187,7 @@ class CentralModel:
 
     def innovations(self, factors: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return innovations (M,) in units of the noise, and their variances, by ``factors``."""
-        plant = sum(v.Q is not None for v in self.variances)
-        weights = np.append(factors[:plant], 1.0)
+        weights = np.append(factors[: sum(v.Q is not None for v in self.variances)], 1.0)
         Q = np.ascontiguousarray(np.einsum("j,ljab->lab", weights, self._parts))
         r = np.append(factors, 1.0)[self._of]
         v, S = np.empty(len(self.y)), np.empty(len(self.y))
@@ -375,8 +373,7 @@ def fit_noise(
     is_plant = np.arange(count) < plant
     # The best of a few mixtures, from which to climb.
     shifts = [np.where(is_plant, one, other) for one, other in itertools.product(STARTS, STARTS)]
-    start = max(shifts, key=lambda theta: model.value(np.exp(theta)))
-    best = _climb(model.value, start)
+    best = _climb(model.value, max(shifts, key=lambda theta: model.value(np.exp(theta))))
     leaps = np.kron(np.eye(count), np.transpose([LEAPS]))
     for _ in range(MAX_CLIMBS):
         # A variance that is far too small does not slope.

@@ -172,8 +172,7 @@ class _Search:
         needed = np.array([c.needed for c in ranked[:count]], dtype=np.intp)
         # A message that needs k messages, itself included, needs one of each lower number: sorted,
         # the numbers are at most 1, 2, 3, ...
-        joined = np.sort(needed[chosen], axis=1) <= np.arange(1, size + 1)
-        chosen = chosen[joined.all(axis=1)]
+        chosen = chosen[(np.sort(needed[chosen], axis=1) <= np.arange(1, size + 1)).all(axis=1)]
         # Keys in sorted order, so that a set has one form whatever the ranks of its members.
         keys = sorted(c.key for c in ranked[:count])
         index_of_key = {key: k for k, key in enumerate(keys)}

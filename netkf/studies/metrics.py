@@ -183,8 +183,7 @@ def central_traces(scenario: Scenario) -> FloatArray:
         raise TheoryError("sensors sample at random times: the central filter has a bound, no P")
     require_every_reading(scenario)
     network = dataclasses.replace(scenario.network, clocks=())
-    filtering = Filtering(algorithm=Central())
-    central = dataclasses.replace(scenario, filter=filtering, network=network)
+    central = dataclasses.replace(scenario, filter=Filtering(algorithm=Central()), network=network)
     if scenario.slotted:
         _require_fixed_H(scenario)
         P = _slot_covariances(scenario, 0, scenario.plant.start_cov, central.model_pieces)

@@ -110,8 +110,7 @@ def _read_curves(path: Path, runs: int, base: Scenario) -> tuple[ErrorCurve, ...
     for label, table in numbers.groupby(read_texts(path, "filter").astype(str), sort=False):
         times, square, se, bound, central = (table[name].to_numpy() for name in names)
         known = bound if np.isfinite(bound).all() else None
-        curve = ErrorCurve(str(label), times, square, se, runs, central[0], known, base.unit)
-        curves.append(curve)
+        curves.append(ErrorCurve(str(label), times, square, se, runs, central[0], known, base.unit))
     return tuple(curves)
 
 

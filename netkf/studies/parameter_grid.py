@@ -79,8 +79,7 @@ def values_of_grid(grid: Any) -> dict[str, list[Any]]:
         raise ScenarioError("--vary", "needs a key with its values", found, "KEY=V1,V2,...")
     values_by_key = {}
     for key, values in grid.items():
-        listed = isinstance(values, (list, tuple, range, np.ndarray)) and len(values)
-        if not listed:
+        if not (isinstance(values, (list, tuple, range, np.ndarray)) and len(values)):
             raise ScenarioError("--vary", f"{key} needs a list of values", values, "give some")
         plain = values.tolist() if isinstance(values, np.ndarray) else list(values)
         with errors_under(str(key)):
@@ -125,9 +124,7 @@ def _require_apart(keys: list[str]) -> None:
 
 
 class GridPoint(NamedTuple):
-    """A point of a grid: the changes of keys, the scenario with them, and the changes as entries
-    of a table's columns.
-    """
+    """A point of a grid: changes of keys, the scenario with them, and their entries in a table."""
 
     changes: dict[str, Any]
     scenario: Scenario

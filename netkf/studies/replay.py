@@ -64,9 +64,7 @@ class Outcome(NamedTuple):
 
 
 class Replayer:
-    """Replays a run up to ``at`` seconds, for the state of ``node`` at that time; ``count`` is the
-    number of replays so far.
-    """
+    """Replays a run up to ``at`` seconds for the state of ``node``; ``count`` replays were made."""
 
     def __init__(self, scenario: Scenario, seed: int, replica: int, node: int, at: float) -> None:
         self.scenario, self._seed, self._replica = scenario, seed, replica
@@ -121,8 +119,7 @@ class Replayer:
             without_delay = self.delayed if chosen is None else chosen & self.delayed
         # The channel models of both scenarios read these when messages are sent.
         self._deliveries.choose(chosen, without_delay)
-        scenario = self._full if to_horizon else self._short
-        run = simulate(scenario, self._seed, self._replica)
+        run = simulate(self._full if to_horizon else self._short, self._seed, self._replica)
         k, n = self._node, int(self.scenario.sizes[self._node])
         outcome = Outcome(run.xhat[-1, k, :n], run.P[-1, k, :n, :n], run.error[-1, k, :n])
         if run.times[-1] != self.at:  # it diverged before

@@ -204,8 +204,7 @@ class Search:
             middle = (low + high) // 2
             return int(middle) if low < middle < high else None
         # A range of several octaves is halved on a logarithmic scale.
-        wide = low > 0.0 and high > 2.0 * low
-        middle = math.sqrt(low * high) if wide else 0.5 * (low + high)
+        middle = math.sqrt(low * high) if low > 0.0 and high > 2.0 * low else 0.5 * (low + high)
         middle = float(f"{middle:.{DIGITS[self.by]}g}")
         return middle if low < middle < high else None
 
@@ -270,14 +269,12 @@ class Search:
             end = by_value[-1] if grows else by_value[0]
             is_further = grows == (end.value > 0.0)
             return self._advise_range(end.value, end.value * (10.0 if is_further else 0.1))
-        nearest = next(probe for probe in by_value if probe.value == misses)
-        runs = self._advise_runs(nearest)
+        runs = self._advise_runs(next(probe for probe in by_value if probe.value == misses))
         if value is not None:
             return runs
         # The nearest end and the next value tried.
         end, inner = (by_value[0], by_value[1]) if grows else (by_value[-1], by_value[-2])
-        further = self._advise_beyond(end, inner, grows)
-        return "; ".join(text for text in (further, runs) if text)
+        return "; ".join(text for text in (self._advise_beyond(end, inner, grows), runs) if text)
 
     def _advise_beyond(self, end: Probe, inner: Probe, grows: bool) -> str:
         """Advise on a range beyond the probe ``end``, extrapolated from it and ``inner``."""

@@ -87,8 +87,7 @@ def sweep(
     import pandas as pd
 
     plan = plan_sweep(scenario, vary, runs, seed, engine)
-    rows = _simulate_points(plan, PoolOptions(workers, executor, scheduler), progress)
-    return pd.DataFrame(rows)
+    return pd.DataFrame(_simulate_points(plan, PoolOptions(workers, executor, scheduler), progress))
 
 
 @dataclass(frozen=True)

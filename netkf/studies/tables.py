@@ -79,18 +79,13 @@ def format_answer(sizing: Sizing) -> str:
     extreme = "largest" if sizing.grows else "smallest"
     if sizing.misses is None:
         return f"{sizing.key} = {sizing.value:g}: all of {span} reaches {sizing.target}"
+    found = f"{sizing.key} = {sizing.value:g} is the {extreme}"
     miss = next(probe for probe in sizing.probes if probe.value == sizing.misses)
     if miss.target == "not shown":
-        return (
-            f"{sizing.key} = {sizing.value:g} is the {extreme} for which the bound shows "
-            f"{sizing.target}; at {sizing.misses:g} the bound is above the limit, the quantity may "
-            "not be"
-        )
+        above = f"at {sizing.misses:g} the bound is above the limit, the quantity may not be"
+        return f"{found} for which the bound shows {sizing.target}; {above}"
     verb = "misses it" if miss.target == "missed" else "was not shown to"
-    return (
-        f"{sizing.key} = {sizing.value:g} is the {extreme} that reaches {sizing.target}; "
-        f"{sizing.misses:g} {verb}"
-    )
+    return f"{found} that reaches {sizing.target}; {sizing.misses:g} {verb}"
 
 
 def format_consistency(consistency: Consistency, full: bool = True) -> str:
@@ -122,18 +117,16 @@ def format_consistency(consistency: Consistency, full: bool = True) -> str:
     of_largest = f"; for n = {all_sizes[-1]}, others by theirs" if len(all_sizes) > 1 else ""
     ends = f"{consistency.low:.4g} .. {consistency.high:.4g}"
     scaled = f"{consistency.low / consistency.n:.4g} .. {consistency.high / consistency.n:.4g}"
-    return "\n".join(
-        [
-            format_table(header, rows if full else shorten_rows(rows, MAX_ROWS)),
-            "",
-            f"{consistency.runs:,} runs, n = {sizes}; +-: half width of the interval on the "
-            f"difference from the expected NEES, all {rows_are} together at confidence {level}",
-            f"inside: samples whose mean over the runs lies in {ends} (ANEES {scaled}), the "
-            f"chi-square bounds at {level} where P is exact{of_largest}",
-            *filter(None, [consistency.states]),
-            *(f"note: {note}" for note in consistency.notes),
-        ]
-    )
+    lines = [
+        format_table(header, rows if full else shorten_rows(rows, MAX_ROWS)),
+        "",
+        f"{consistency.runs:,} runs, n = {sizes}; +-: half width of the interval on the "
+        f"difference from the expected NEES, all {rows_are} together at confidence {level}",
+        f"inside: samples whose mean over the runs lies in {ends} (ANEES {scaled}), the "
+        f"chi-square bounds at {level} where P is exact{of_largest}",
+    ]
+    lines += [*filter(None, [consistency.states]), *(f"note: {n}" for n in consistency.notes)]
+    return "\n".join(lines)
 
 
 def format_filters(comparison: FilterComparison) -> str:

@@ -186,8 +186,7 @@ def _explain_errors(scenario: Scenario) -> str:
     if not scenario.filters_know_the_truth:
         raise TheoryError("the filters' model differs from the truth: P need not bound the errors")
     rows = assumptions(scenario)
-    start = rows[rows["assumption"].str.startswith("P_i(0) >= ")]
-    if not start["holds"].all():
+    if not rows[rows["assumption"].str.startswith("P_i(0) >= ")]["holds"].all():
         raise TheoryError("P_i(0) is below the covariance of the first error: P need not bound it")
     exact = not scenario.other_starts and not scenario.filter.algorithm.timing.talks
     return "" if exact else "; P_i in turn bounds the covariance of the error, Tanwani's H (10)"
