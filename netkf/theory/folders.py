@@ -10,6 +10,7 @@ from netkf.algorithms.belief_propagation import is_forest
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.columns import ErrorColumns
+from netkf.theory.common.delayed_jumps import DelayedJumps
 from netkf.theory.common.evidence import AssumptionRow
 from netkf.theory.common.jumps import ClockJumps, SlotJumps
 from netkf.theory.common.plant_assumptions import model_and_start_rows
@@ -26,7 +27,7 @@ from netkf.theory.stochastic_trigger.errors import UNHEARD, all_hear_all, error_
 from netkf.theory.track_fusion.steady_errors import tracks_in_slots
 from netkf.trace.run import Run
 
-LinearErrors = SlotJumps | ClockJumps
+LinearErrors = SlotJumps | ClockJumps | DelayedJumps
 Rows = Callable[[Scenario], list[AssumptionRow]]
 ARRIVES = "every message arrives in its slot"
 

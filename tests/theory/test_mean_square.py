@@ -6,11 +6,14 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 
 import netkf
 from netkf import theory
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.network.losses import Transmission
+from netkf.theory import mean_square
+from netkf.theory.common import delayed_jumps
 from netkf.theory.promises import compute_promises, promises_text
 from tests.algorithms.test_literature import ROTATION, discretised, scenario_of
 
@@ -297,6 +300,138 @@ def test_clocks_at_links_directions_and_nodes(at, channel, tmp_path):
     np.testing.assert_allclose(found[:, 0, 0], np.diag(X), rtol=1e-9)
 
 
+# Messages that take time.
+
+
+def delayed_scalar(a, rate, p, delay, L=1.3, R=0.5, w=0.5):
+    """E[e0 e0] and E[e1 e1] where node 1 hears node 0, after ``delay`` seconds, by quadrature of
+    E[e(t) r_s(t)], r_s being the error of node 0's estimate of s seconds ago, predicted to t.
+    """
+    heard, k, h = rate * p * w, 2.0 * a - L, 2.0 * a - rate * p * w
+    X00 = (1.0 + L * L * R) / (2.0 * (L - a))
+
+    def added(s):
+        return (math.exp(2.0 * a * s) - 1.0) / (2.0 * a)
+
+    def own(s):  # E[e0 r_s]
+        return math.exp(k * s) * X00 + (math.exp(k * s) - 1.0) / k
+
+    def slope(s):  # E[m r_s], m being sent before: both are predicted from then on
+        return 1.0 + heard * (math.exp(2.0 * a * s) * own(delay - s) + added(s))
+
+    X01 = (1.0 + heard * own(delay)) / (L - 2.0 * a + heard)
+    more, _ = quad(lambda s: math.exp(h * (delay - s)) * slope(s), 0.0, delay, epsabs=1e-13)
+    across, sent = math.exp(h * delay) * X01 + more, math.exp(2.0 * a * delay) * X00 + added(delay)
+    jumps = rate * p * (2.0 * w * (1.0 - w) * across + w * w * sent)
+    return X00, (1.0 + jumps) / (rate * p * (1.0 - (1.0 - w) ** 2) - 2.0 * a)
+
+
+@pytest.mark.parametrize("delay", [1e-6, 0.3, 4.0])
+def test_a_node_that_hears_another_late(delay, tmp_path):
+    a, rate, p = 0.2, 2.0, 0.7
+    late = {"kind": "constant", "seconds": delay}
+    scenario = scalar(tmp_path, a, rate, loss={"kind": "bernoulli", "delivery": p}, delay=late)
+    found = theory.steady_error_covariance(scenario)
+    np.testing.assert_allclose(found[:, 0, 0], delayed_scalar(a, rate, p, delay), rtol=1e-9)
+
+
+def test_delays_do_not_move_the_threshold_of_a_node_that_nobody_needs(tmp_path):
+    """What it hears is bounded: lambda > 2 a / (w (2 - w)) as without delay."""
+    a, w = 0.3, 0.5
+    threshold, late = 2.0 * a / (w * (2.0 - w)), {"kind": "constant", "seconds": 0.7}
+    for factor in (0.98, 1.02):
+        scenario = scalar(tmp_path, a, factor * threshold, delay=late)
+        radius = theory.mean_square_radius(scenario)
+        assert (radius < 1.0) == (factor > 1.0)
+        # The proof that needs no radius says the same.
+        assert mean_square.linear_errors(scenario).is_bounded == (factor > 1.0)
+
+
+def late_network(folder, at, channel, delay, edges=None, horizon=5.0, probe=1.0):
+    """Four nodes of a plant that turns, two of which take samples; or other ones."""
+    growth, graph = -0.1, NETWORK if edges is None else {"kind": "edges", "edges": edges}
+    plant = {
+        "kind": "diffusion",
+        "A": [[growth, 1.0], [-1.0, growth]],
+        "B": [[0.5, 0.1], [0.0, 0.7]],
+    }
+    plant |= {"cov": [[1.0, 0.0], [0.0, 1.0]]}
+    sampling = {"kind": "poisson", "rate": 2.0}
+    nodes = [0, 2] if edges is None else [0]
+    sensor = {"nodes": nodes, "H": [[1.0, 0.3]], "R": [[0.3]], "sampling": sampling}
+    channel = {**CHANNELS[channel], "delay": {"kind": "constant", "seconds": delay}}
+    network = {"graph": graph, "channel": channel}
+    network["activation"] = {"kind": "poisson", "rate": 1.5, "at": at}
+    algorithm = {"kind": "constant-gain", "gain": [[0.5], [0.1]]}
+    return scenario_of(
+        algorithm, folder, plant=plant, sensors=[sensor], network=network, horizon=horizon,
+        probe=probe,
+    )  # fmt: skip
+
+
+@pytest.mark.one_in(3)
+@pytest.mark.parametrize("channel", ["losses", "losses of both"])
+@pytest.mark.parametrize("at", ["links", "directions", "nodes"])
+def test_a_short_delay_is_nearly_none(at, channel, tmp_path):
+    none = theory.steady_error_covariance(late_network(tmp_path, at, channel, 0.0))
+    short = theory.steady_error_covariance(late_network(tmp_path, at, channel, 1e-7))
+    np.testing.assert_allclose(short, none, rtol=2e-6, atol=1e-9)
+
+
+def test_large_and_small_problems_are_solved_alike(tmp_path, monkeypatch):
+    """By elimination and by iteration, and with half as many points again."""
+    scenario = late_network(tmp_path, "links", "losses", 0.8, edges=[[0, 1]])
+    small = theory.steady_error_covariance(scenario)
+    for name, value in (("MAX_DENSE", 0), ("MAX_DENSE_MEAN", 0), ("MIN_POINTS", 18)):
+        monkeypatch.setattr(delayed_jumps, name, value)
+        again = theory.steady_error_covariance(scenario.replace({"name": name}))
+        np.testing.assert_allclose(again, small, rtol=1e-10)
+
+
+def test_nodes_of_a_ring_that_are_alike_have_one_mean_square(tmp_path):
+    """100 errors: the problem has no symmetry in it but that of the network."""
+    ring = {"kind": "cycle", "nodes": 50}
+    scenario = late_network(tmp_path, "links", "losses", 0.8, edges=[[0, 1]])
+    changes = {"network.graph": ring, "sensors.0.nodes": list(range(50))}
+    found = theory.steady_error_covariance(scenario.replace(changes))
+    np.testing.assert_allclose(found, np.broadcast_to(found[0], found.shape), rtol=1e-9)
+    # Of three nodes each hears two others, as here, but what they say is more alike.
+    changes = {"network.graph.nodes": 3, "sensors.0.nodes": [0, 1, 2]}
+    few = theory.steady_error_covariance(scenario.replace({"network.graph": ring}).replace(changes))
+    assert np.trace(found[0]) < np.trace(few[0]) < 1.1 * np.trace(found[0])
+
+
+def late_averages(folder, at, channel, horizon):
+    """Exact traces, those of exact covariances given the events averaged over a run, and their
+    standard errors, of means of 40 parts.
+    """
+    scenario = late_network(folder, at, channel, 0.4, horizon=horizon, probe=0.5)
+    expected = np.trace(theory.steady_error_covariance(scenario), axis1=1, axis2=2)
+    given = theory.error_covariance(scenario, netkf.simulate(scenario, seed=5))
+    traces = np.trace(given, axis1=2, axis2=3)[100:]
+    parts = traces[: len(traces) // 40 * 40].reshape(40, -1, traces.shape[1]).mean(axis=1)
+    return expected, parts.mean(axis=0), parts.std(axis=0, ddof=1) / math.sqrt(40)
+
+
+@pytest.mark.slow
+def test_a_run_with_delays_has_these_mean_squares(tmp_path):
+    """Without delays they would be smaller by 8 to 14 %."""
+    expected, mean, deviation = late_averages(tmp_path, "links", "losses", 1200.0)
+    assert (deviation < 0.015 * expected).all()
+    assert np.abs((mean - expected) / deviation).max() < 4.5
+    none = theory.steady_error_covariance(late_network(tmp_path, "links", "losses", 0.0))
+    assert (np.trace(none, axis1=1, axis2=2) < 0.93 * expected).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("channel", ["losses", "losses of both"])
+@pytest.mark.parametrize("at", ["links", "directions", "nodes"])
+def test_hundred_thousand_events_with_delays(at, channel, tmp_path):
+    expected, mean, deviation = late_averages(tmp_path, at, channel, 3000.0)
+    assert (deviation < 0.01 * expected).all()
+    assert np.abs((mean - expected) / deviation).max() < 4.5
+
+
 EACH = {"kind": "periodic", "period": 0.5}
 
 
@@ -393,7 +528,8 @@ def test_what_has_no_constant_gains_is_refused_with_the_reason(tmp_path):
             scenario_of(CONSTANT, tmp_path, **{**clocked, "network": apart}),
             "do not sample at the ticks",
         ),
-        (scalar(tmp_path, 0.1, 5.0, delay=late), "take no time"),
+        (scalar(tmp_path, 0.1, 5.0, loss=BURSTS, delay=late), "take no time"),
+        (scalar(tmp_path, 0.1, 5000.0, delay=late), "give a shorter delay or lower rates"),
     ]
     for scenario, words in cases:
         with pytest.raises(netkf.TheoryError) as caught:

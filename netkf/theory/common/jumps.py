@@ -163,7 +163,7 @@ class ClockJumps:
         return pairs
 
     @cached_property
-    def _all_pairs(self) -> tuple[IntArray, IntArray, FloatArray]:
+    def all_pairs(self) -> tuple[IntArray, IntArray, FloatArray]:
         """Pairs (P,) of directions of all clocks, and the rates (S, P) at which both arrive."""
         first, second = (np.concatenate([pair[k] for pair in self._pairs]) for k in (0, 1))
         return first, second, np.concatenate([rates for *_, rates in self._pairs], axis=1)
@@ -176,16 +176,21 @@ class ClockJumps:
             self.directions.mean(self.nodes, tick_directions) for _, tick_directions in self.ticks
         ]
 
-    def inflow(self, X: FloatArray) -> FloatArray:
-        """Return what jumps add to dX/dt beyond B X + X B' and the noise: a positive map."""
-        total = np.zeros_like(X)
+    def sampled(self, X: FloatArray) -> FloatArray:
+        """Return the part (S, M, M) of ``inflow`` that samples add, for moments X (S, M, M)."""
+        inflow = np.zeros_like(X)
         for node, rate, lost in self.samples:
             block = _block_slice(X, self.nodes, node)
-            _block_slice(total, self.nodes, node)[...] += rate * lost @ block @ lost.T
+            _block_slice(inflow, self.nodes, node)[...] += rate * lost @ block @ lost.T
+        return inflow
+
+    def inflow(self, X: FloatArray) -> FloatArray:
+        """Return what jumps add to dX/dt beyond B X + X B' and the noise: a positive map."""
+        total = self.sampled(X)
         if self.directions is None or not self.ticks:
             return total
         if self.directions.steps is None:
-            return np.asarray(total + self.directions.products(*self._all_pairs, X))
+            return np.asarray(total + self.directions.products(*self.all_pairs, X))
         for k, (rate, _) in enumerate(self.ticks):
             chains, (first, second, rates) = self._chains[k], self._pairs[k]
             stepped = self.directions.advance(X, chains)

@@ -13,6 +13,7 @@ from netkf.linalg.arrays import FloatArray, block_diagonal, square_root, symmetr
 from netkf.network.clocks import LinkClock, Periodic
 from netkf.plants.transitions import Transitions
 from netkf.scenario.scenario import Scenario
+from netkf.theory.common.delayed_jumps import DelayedJumps
 from netkf.theory.common.jumps import ClockJumps, SlotJumps
 from netkf.theory.common.random_links import (
     Directions,
@@ -57,9 +58,9 @@ class SampledNode(NamedTuple):
     noise: FloatArray
 
 
-def clock_jumps(scenario: Scenario) -> ClockJumps | SlotJumps:
+def clock_jumps(scenario: Scenario) -> ClockJumps | DelayedJumps | SlotJumps:
     """Return the errors as a linear system with jumps, for Poisson clocks, or periodic ones from
-    tick to tick. Raises TheoryError for others, random delays, and delays under Poisson clocks.
+    tick to tick. Raises TheoryError for others, random delays, and delays beside bursts.
     """
     drifts, noise = _error_flow(scenario)
     samples, weights = _sampled_nodes(scenario), link_weights(scenario)
@@ -70,8 +71,10 @@ def clock_jumps(scenario: Scenario) -> ClockJumps | SlotJumps:
         directions_of_tick = directions_of(scenario, weights, clock.period)
         return _from_tick_to_tick(clock, (drifts, noise), samples, directions_of_tick, delay)
     directions = directions_of(scenario, weights, math.inf) if talks else None
-    if delay:
-        raise TheoryError("exact mean squares under Poisson clocks need messages that take no time")
+    if delay and directions is not None and directions.modes > 1:
+        raise TheoryError(
+            "exact mean squares of bursts under Poisson clocks are known if messages take no time"
+        )
     n, sampled_nodes = scenario.plant.n, []
     for sensor in samples:
         if sensor.clock is None or not sensor.clock.memoryless:
@@ -83,7 +86,12 @@ def clock_jumps(scenario: Scenario) -> ClockJumps | SlotJumps:
         sampled_nodes.append((sensor.node, rate, sensor.correction))
     drift = block_diagonal(list(drifts))
     ticks = poisson_ticks(scenario, list(weights)) if talks else ()
-    return ClockJumps(len(drifts), drift, noise, tuple(sampled_nodes), directions, ticks)
+    instant = ClockJumps(len(drifts), drift, noise, tuple(sampled_nodes), directions, ticks)
+    if not delay or not ticks:
+        return instant
+    return DelayedJumps(
+        instant, scenario.diffusion.A, scenario.diffusion.B @ scenario.diffusion.B.T, delay
+    )
 
 
 def _node_slice(k: int, n: int) -> slice:
