@@ -99,7 +99,6 @@ def _array(directory: Path, name: str, tasks: int, options: argparse.Namespace) 
     """Return the submission script of an array of ``tasks`` SLURM jobs on a plan."""
     trust = ["--trust"] if options.trust else []
     minutes = round((options.time or 3600) / 60)
-    limit = f"{minutes - MARGIN}m"
     return ARRAY.format(
         name="".join(c if c.isalnum() or c in "-_." else "-" for c in f"netkf-{name}")[:100],
         last=tasks - 1,
@@ -107,7 +106,7 @@ def _array(directory: Path, name: str, tasks: int, options: argparse.Namespace) 
         hours=minutes // 60,
         minutes=minutes % 60,
         log=shlex.quote(str(directory.parent / f"{directory.name}-%A_%a.log")),
-        work=shlex.join(["netkf", "work", str(directory), "--for", limit, *trust]),
+        work=shlex.join(["netkf", "work", str(directory), "--for", f"{minutes - MARGIN}m", *trust]),
         merge=shlex.join(["netkf", "merge", str(directory), *trust]),
     )
 

@@ -90,7 +90,6 @@ def _figure_names(text: str) -> list[str]:
     for name in names:
         known = (*FIGURE_NAMES, *FIT_FIGURES)
         if name not in known:
-            hint = suggest_nearest(name, known)
-            remedy = f"{hint}figures are {', '.join(known)}"
+            remedy = f"{suggest_nearest(name, known)}figures are {', '.join(known)}"
             raise ScenarioError("figure", "is not known", name, remedy)
     return names

@@ -153,14 +153,13 @@ class BlockCheckpoints(BlockFiles):
         averages = np.arange(statistics.averages.mean.shape[1]) % 3 == 1  # traces of P
         # In slots transmissions are not counted.
         messages = np.arange(len(MESSAGES)) < len(MESSAGES) - self._scenario.slotted
-        used = zip(moments, (samples, averages, messages), strict=False)
         return (
             not math.isnan(statistics.rounding_from)
             and all((count >= 0).all() for count in counts)
             and all((quantity.size <= statistics.runs).all() for quantity in moments)
             and not any(
                 np.isnan(values[quantity.size > 0][:, which]).any()
-                for quantity, which in used
+                for quantity, which in zip(moments, (samples, averages, messages), strict=False)
                 for values in (quantity.mean, quantity.M2)
             )
         )

@@ -92,9 +92,7 @@ class AdaptivePool(LocalPool):
         """Run the block in this process, or submit it to workers once that would save time."""
         if self._processes is None and self._worth_processes(job):
             self._processes = ProcessPool(self.width)
-        if self._processes is not None:
-            return self._processes.submit(job)
-        return super().submit(job)
+        return super().submit(job) if self._processes is None else self._processes.submit(job)
 
     def next_size(self, left: int) -> int:
         """Return the size of the next block: small here, larger for worker processes."""
@@ -124,9 +122,7 @@ class AdaptivePool(LocalPool):
 
     def wait(self, futures: Collection[Future[BlockResult]]) -> Collection[Future[BlockResult]]:
         """Wait until one of the futures is done; return all that are."""
-        if self._processes is None:
-            return super().wait(futures)
-        return self._processes.wait(futures)
+        return super().wait(futures) if self._processes is None else self._processes.wait(futures)
 
     def close(self, at_once: bool) -> None:
         """End the processes, if any were started."""

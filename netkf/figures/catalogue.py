@@ -95,8 +95,7 @@ class FigureSet:
         is left out because it takes minutes. Raises ScenarioError for an unknown name.
         """
         if name not in self.names:
-            hint = suggest_nearest(name, self.names)
-            remedy = f"{hint}its figures are {', '.join(self.names)}"
+            remedy = f"{suggest_nearest(name, self.names)}its figures are {', '.join(self.names)}"
             raise ScenarioError("figure", "is not known", name, remedy)
         with style_context():
             try:

@@ -269,7 +269,6 @@ def collect_figure_data(
 
 def reduce_ensemble(scenario: Scenario, ensemble: Ensemble, promised: PromisedTraces) -> FigureData:
     """Return the data of an ensemble: means over runs (T, N) with standard errors."""
-    default_status = "diverged" if ensemble.diverged else "complete"
     return FigureData(
         scenario=scenario,
         times=ensemble.times,
@@ -282,7 +281,7 @@ def reduce_ensemble(scenario: Scenario, ensemble: Ensemble, promised: PromisedTr
         promised=promised,
         seed=ensemble.seed,
         # Only ensembles that were read from a directory have a status.
-        status=getattr(ensemble, "status", default_status),
+        status=getattr(ensemble, "status", "diverged" if ensemble.diverged else "complete"),
         runs=int(ensemble.runs.max(initial=0)),
         diverged=ensemble.diverged,
         rounding_from=ensemble.rounding_from,

@@ -171,9 +171,7 @@ def _draw_age_distribution(
 
 def _last_time(data: FigureData) -> float:
     """Return the time of the last event or sample in seconds; the horizon if that is 0."""
-    last = float(data.log["t"][-1])
-    if len(data.times):
-        last = max(last, float(data.times[-1]))
+    last = max([float(data.log["t"][-1]), *data.times[-1:].tolist()])
     return last if last > 0.0 else data.scenario.horizon
 
 

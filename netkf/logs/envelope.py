@@ -236,11 +236,10 @@ def measure_run(scenario: Scenario, run: Run) -> dict[str, float]:
     t, *samples = (part[later] for part in (run.times, run.x, run.xhat, run.P, run.error))
     network.states(t, *samples)
     network.finish()
-    age = float(t.mean() - np.mean([one.mean() for one in network.newest_heard(t)]))
     return {
         f"RMS {kind}": float(np.sqrt(by_time.mean())),
         f"{kind} at the worst instant": float(np.sqrt(by_time.max())),
-        "mean age (s)": age,
+        "mean age (s)": float(t.mean() - np.mean([one.mean() for one in network.newest_heard(t)])),
         "messages heard": float(run.count("deliver")),
         "time connected": float(network.shares()[-1]),
     }

@@ -477,10 +477,9 @@ def _varying_laws(
     if len(edges):
         counts = stats.counts_in(outcomes, edges)
         begins = [0.0, *edges.tolist()]
-        ends = [*edges.tolist(), end]
         rows = [
             (a, b, link, k)
-            for k, (a, b) in enumerate(zip(begins, ends, strict=True))
+            for k, (a, b) in enumerate(zip(begins, [*edges.tolist(), end], strict=True))
             for link in index
         ]
         laws.append(_varying_law("scheduled", counts, rows, shrink))

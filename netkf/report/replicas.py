@@ -40,8 +40,7 @@ class Replicas(NamedTuple):
         if place is None:
             return f"replica {number}"
         ranks = "".join(f"{rank}, " for rank in RANKS if self.index_of_rank(rank) == place)
-        error = format_number(float(self.errors[place]))
-        return f"replica {number} ({ranks}RMS error {error})"
+        return f"replica {number} ({ranks}RMS error {format_number(float(self.errors[place]))})"
 
     def index_of_rank(self, rank: str) -> int:
         """Return the place in ``numbers`` of a rank, ``worst`` or ``median``."""
@@ -108,8 +107,7 @@ def spread_curves(replicas: Replicas | None, nodes: tuple[int, ...]) -> dict[str
     """Return median, 5 % and 95 % of the errors of each node over time, as JSON values."""
     if replicas is None or replicas.spread.size > MAX_VALUES:
         return None
-    columns = np.moveaxis(replicas.spread, 1, 0)
     return {
         str(node): [to_json_value(curve.tolist()) for curve in found.T]
-        for node, found in zip(nodes, columns, strict=True)
+        for node, found in zip(nodes, np.moveaxis(replicas.spread, 1, 0), strict=True)
     }

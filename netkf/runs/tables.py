@@ -31,9 +31,7 @@ BOUND_COLUMNS = ("bound", "ratio")
 
 def format_number(value: float | None) -> str:
     """Return a number with four significant digits; a dash if it is None or not finite."""
-    if value is None or not math.isfinite(value):
-        return "-"
-    return f"{value:.4g}"
+    return "-" if value is None or not math.isfinite(value) else f"{value:.4g}"
 
 
 def format_with_error(value: float | None, error: float | None) -> str:

@@ -103,8 +103,7 @@ def _check_readings(scenario: DerivedScenario, key: str, sensor: Sensor) -> None
     ):
         for node in listed:
             if node not in scenario.topology.index:
-                line = record.columns.lines[ids.index(node)]
-                where = f"in column {name} of line {line}"
+                where = f"in column {name} of line {record.columns.lines[ids.index(node)]}"
                 rule = f"{record.path.name} names a node that the graph does not have, {where}"
                 raise ScenarioError(f"{key}.path", rule, node, "correct the row or the graph")
     if scenario.slotted:
@@ -156,10 +155,9 @@ def count_state_rows(scenario: DerivedScenario) -> dict[str, RowUse]:
     """Return the use of the rows of recorded states by key path."""
     if scenario.plant.record is None:
         return {}
-    places = zip(scenario.all_plants, scenario.layout.places, strict=True)
     return _sum_by_key(
         (key, plant.record.use(_state_times(scenario, place).tolist()))
-        for (key, plant), place in places
+        for (key, plant), place in zip(scenario.all_plants, scenario.layout.places, strict=True)
         if plant.record is not None
     )
 

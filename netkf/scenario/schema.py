@@ -343,6 +343,4 @@ def _format_default(key: TableKey) -> str:
         return str(key.default).lower()
     if isinstance(key.default, str):
         return f'"{key.default}"' if key.default else "none"
-    if isinstance(key.default, (int, float)):
-        return f"{key.default:g}"
-    return "none"
+    return f"{key.default:g}" if isinstance(key.default, (int, float)) else "none"

@@ -200,6 +200,4 @@ def toml_text(value: Any) -> str:
         return "true" if value else "false"
     if isinstance(value, SourceFile):
         return json.dumps(value.name, ensure_ascii=False)
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
-    return repr(value)
+    return json.dumps(value, ensure_ascii=False) if isinstance(value, str) else repr(value)

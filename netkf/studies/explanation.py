@@ -202,8 +202,7 @@ class Why:
 
     def _state_sentences(self) -> Iterator[str]:
         run = f"seed {self.seed}, replica {self.replica}"
-        scenario = shorten(self.scenario, 60)
-        sentence = f"Node {self.node} at {self.at:g} s ({scenario}, {run})"
+        sentence = f"Node {self.node} at {self.at:g} s ({shorten(self.scenario, 60)}, {run})"
         if math.isfinite(self.trace):
             rms = math.sqrt(max(self.trace, 0.0))
             sentence += f": trace P is {self.trace:.4g}{in_unit(self.unit, 2)}, which claims an "
@@ -250,10 +249,9 @@ class Why:
         )
         without_reading = [s for s in sensors if math.isnan(s.reading)]
         if with_reading:
-            oldest = with_reading[:MAX_LISTED]
             parts = [
                 f"{self.at - s.reading:.4g} s old from node {s.node} ({_format_route(s)})"
-                for s in oldest
+                for s in with_reading[:MAX_LISTED]
             ]
             prefix = "The oldest of its" if len(with_reading) > MAX_LISTED else "Its"
             yield f"{prefix} newest readings are {_join_with_and(parts)}."
@@ -411,6 +409,4 @@ def _list_items(items: Sequence[object], other: str = "other") -> str:
 
 
 def _join_with_and(parts: Sequence[str]) -> str:
-    if len(parts) < 2:
-        return "".join(parts)
-    return f"{', '.join(parts[:-1])} and {parts[-1]}"
+    return "".join(parts) if len(parts) < 2 else f"{', '.join(parts[:-1])} and {parts[-1]}"

@@ -85,11 +85,10 @@ def expected_metrics(scenario: Scenario, seed: int, replica: int, engine: Engine
         return block_metrics(scenario, seed, range(replica, replica + 1), engine)
     square = time_average(scenario, traces(error_squares(scenario, run)))[None]
     trace = time_average(scenario, traces(run.P))[None]
-    counts = np.array([[run.count(kind) for kind in KINDS]])
     return RunMetrics(
         mean_square=square,
         trace=trace,
-        messages=count_messages(counts, scenario.slotted),
+        messages=count_messages(np.array([[run.count(kind) for kind in KINDS]]), scenario.slotted),
         diverged=np.zeros((1, 1)),
         rounding_from=np.full((1, 1), np.inf),  # expectations do not suffer from rounding
     )

@@ -185,9 +185,7 @@ def _filter_legend(
 
 
 def _is_known(row: ComparedFilter, name: str) -> bool:
-    if name in row.traffic:
-        return math.isfinite(row.traffic[name])
-    return name in row.quantities
+    return math.isfinite(row.traffic[name]) if name in row.traffic else name in row.quantities
 
 
 def _format_quantity(cells: Quantity) -> tuple[str, str]:
