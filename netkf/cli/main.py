@@ -11,14 +11,7 @@ import sys
 from collections.abc import Sequence
 from functools import partial
 
-from netkf.cli.process import (
-    INTERRUPTED,
-    Interruption,
-    OutputError,
-    discard_output,
-    run_as_process,
-    safe_streams,
-)
+from netkf.cli import process
 from netkf.core.errors import NetkfError
 from netkf.core.printable import one_line, shorten
 
@@ -49,14 +42,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Threads of OpenBLAS spin while they wait for the next product: on a busy machine commands
         # took up to four times the processor time. Those of a pool of workers have one each, too.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        run_as_process(partial(_run_command, sys.argv[1:]))
-    with Interruption() as interruption:
+        process.run_as_process(partial(_run_command, sys.argv[1:]))
+    with process.Interruption() as interruption:
         return _run_command(arguments, interruption)
 
 
-def _run_command(arguments: Sequence[str], interruption: Interruption) -> int:
+def _run_command(arguments: Sequence[str], interruption: process.Interruption) -> int:
     """Run a command line and print its error; signals raise KeyboardInterrupt while armed."""
-    with safe_streams():
+    with process.safe_streams():
         try:
             interruption.arm()
             status, message = _execute(arguments, interruption)
@@ -68,7 +61,7 @@ def _run_command(arguments: Sequence[str], interruption: Interruption) -> int:
     return status
 
 
-def _execute(arguments: Sequence[str], interruption: Interruption) -> tuple[int, str]:
+def _execute(arguments: Sequence[str], interruption: process.Interruption) -> tuple[int, str]:
     """Return the exit status of a command and its message on standard error, "" without one."""
     try:
         parser = make_parser()
@@ -78,8 +71,8 @@ def _execute(arguments: Sequence[str], interruption: Interruption) -> tuple[int,
         # A full disk or a closed pipe raises its error here at the latest, where it can be reported
         # in one line.
         sys.stdout.flush()
-    except OutputError as error:
-        discard_output()
+    except process.OutputError as error:
+        process.discard_output()
         return BAD_USAGE, f"cannot write: {_error_reason(error.__cause__)}"
     except Exception as error:
         message = _describe_error(error)
@@ -97,7 +90,7 @@ def _execute(arguments: Sequence[str], interruption: Interruption) -> tuple[int,
 
 def _report_interrupt(detail: str) -> tuple[int, str]:
     """Return the outcome of an interrupted command; ``detail`` says what was kept, if known."""
-    return INTERRUPTED, f"interrupted; {detail}" if detail else "interrupted"
+    return process.INTERRUPTED, f"interrupted; {detail}" if detail else "interrupted"
 
 
 def _describe_error(error: Exception) -> str | None:

@@ -23,15 +23,8 @@ from netkf.ensembles.replicas import BlockStore, Node, Progress, replicate_block
 from netkf.ensembles.resume import is_finished
 from netkf.ensembles.statistics import RunStatistics, block_statistics, merge
 from netkf.ensembles.summary import summarise_ensemble
+from netkf.runs import files
 from netkf.runs.failures import InterruptedRunError, explain_failure
-from netkf.runs.files import (
-    check_sources,
-    create_output_directory,
-    run_file_names,
-    scenario_digest,
-    write_json,
-    write_scenario,
-)
 from netkf.runs.parquet_files import ParquetSink, write_table
 from netkf.runs.run import Manifest
 from netkf.runs.simulate import choose_engine
@@ -106,7 +99,7 @@ def runs_to_directory(
     runs = require_runs(runs)
     one_of(*TRACES)("trace", options.trace)
     engine_used = choose_engine(options.engine, scenario, announce=False)
-    check_sources(scenario)
+    files.check_sources(scenario)
     with make_pool(runs, options.pool) as pool:
         writer = _open_directory(scenario, runs, out, options, engine_used.name)
         if writer is None:
@@ -131,7 +124,7 @@ def runs_to_directory(
 
 def identify_runs(scenario: Scenario, runs: int, trace: str, engine: str) -> RunIdentity:
     """Return the identity of the blocks of ``runs`` runs of a scenario."""
-    return RunIdentity(scenario_digest(scenario), scenario.seed, runs, trace, engine)
+    return RunIdentity(files.scenario_digest(scenario), scenario.seed, runs, trace, engine)
 
 
 def _open_directory(
@@ -141,7 +134,7 @@ def _open_directory(
     plan = identify_runs(scenario, runs, options.trace, engine)
     finished = is_finished(out, scenario, plan) if options.resume else None
     if finished is None:
-        return DirectoryWriter(scenario, create_output_directory(out, scenario.name), plan)
+        return DirectoryWriter(scenario, files.create_output_directory(out, scenario.name), plan)
     assert out is not None
     if finished:
         BlockCheckpoints(out, scenario).remove()
@@ -162,7 +155,7 @@ def write_files(
                 tables.add(replica, log, StateSamples(*arrays))
     promised = promise_traces(scenario, scenario.times)
     summary = summarise_ensemble(scenario, statistics, promised)
-    write_json(directory / "summary.json", summary)
+    files.write_json(directory / "summary.json", summary)
     status, seconds = "diverged" if ensemble.diverged else "complete", time.perf_counter() - started
     results = summary, ensemble, promised, writer.simulated
     return FinishedEnsemble(directory, status, *results, seconds)
@@ -191,7 +184,7 @@ class DirectoryWriter:
         """Write the manifest and the scenario, and find the stored blocks of a resumed run."""
         # The manifest comes first: if the process is killed, it states that the run is unfinished.
         self.note()
-        write_scenario(self.directory, self.scenario)
+        files.write_scenario(self.directory, self.scenario)
         self.find_blocks(note)
         if self.known:
             self.note()
@@ -257,7 +250,9 @@ class DirectoryWriter:
             entries["machine"] = machines[0]
         if len(machines) > 1:
             entries["machines"] = list(machines)
-        self._manifest.write(status, entries, self.plan.runs, names=run_file_names(self.scenario))
+        self._manifest.write(
+            status, entries, self.plan.runs, names=files.run_file_names(self.scenario)
+        )
         self._ended = True
 
     def _identity_entries(self, **others: Any) -> dict[str, Any]:

@@ -9,17 +9,7 @@ from typing import Any
 
 from netkf.core.errors import ScenarioError
 from netkf.ensembles.block_files import RunIdentity
-from netkf.runs.documents import (
-    COUNT,
-    FINAL_STATUSES,
-    TEXT,
-    TEXTS,
-    DamagedError,
-    check_files,
-    check_seal,
-    read_document,
-    require_form,
-)
+from netkf.runs import documents
 from netkf.runs.files import BLOCKS_FOLDER, other_files, remove_files, run_file_names
 from netkf.runs.provenance import machine, versions
 from netkf.scenario.plugins import find_module_files
@@ -28,18 +18,18 @@ from netkf.scenario.tables import source_files
 from netkf.scenario.writing import resolve_defaults, to_toml
 
 MANIFEST = {
-    "name": TEXT,
-    "status": TEXT,
-    "engine": TEXT,
-    "seed": COUNT,
-    "replica": COUNT,
-    "runs": {"wanted": COUNT, "done": COUNT},
+    "name": documents.TEXT,
+    "status": documents.TEXT,
+    "engine": documents.TEXT,
+    "seed": documents.COUNT,
+    "replica": documents.COUNT,
+    "runs": {"wanted": documents.COUNT, "done": documents.COUNT},
     "versions": {},
     "machine?": {},
-    "scenario?": TEXT,
-    "trace?": TEXT,
-    "tasks?": COUNT,
-    "arguments?": TEXTS,
+    "scenario?": documents.TEXT,
+    "trace?": documents.TEXT,
+    "tasks?": documents.COUNT,
+    "arguments?": documents.TEXTS,
 }
 """The form of a manifest that runs are resumed from."""
 
@@ -85,11 +75,11 @@ def is_finished(out: Path | None, scenario: Scenario, plan: RunIdentity) -> bool
                 stored = {name: stored.get(name) for name in names}
             raise ScenarioError("--resume", rule, stored, remedy)
     remedy = "remove it: each block is checked by a digest of its own"
-    _require(out / "manifest.json", lambda: check_seal(manifest), remedy)
+    _require(out / "manifest.json", lambda: documents.check_seal(manifest), remedy)
     _check_scenario(out, scenario)
-    finished = manifest["status"] in FINAL_STATUSES
+    finished = manifest["status"] in documents.FINAL_STATUSES
     if finished:
-        _require(out, lambda: check_files(out, manifest), "start in a new directory")
+        _require(out, lambda: documents.check_files(out, manifest), "start in a new directory")
     return finished
 
 
@@ -114,11 +104,11 @@ def clear_unfinished_runs(
         remedy = "give the same --runs"
         raise ScenarioError("--resume", "the run was begun with several runs", 1, remedy)
     _check_scenario(directory, scenario)
-    if manifest["status"] in FINAL_STATUSES:
+    if manifest["status"] in documents.FINAL_STATUSES:
         try:
-            check_seal(manifest)
-            check_files(directory, manifest)
-        except DamagedError as error:
+            documents.check_seal(manifest)
+            documents.check_files(directory, manifest)
+        except documents.DamagedError as error:
             if note is not None:
                 note(f"the run in {directory} is done again: its record {error}")
         else:
@@ -169,7 +159,7 @@ def _require(path: Path, check: Callable[[], None], remedy: str) -> None:
     """Call ``check`` of ``path``; its DamagedError becomes a ScenarioError with ``remedy``."""
     try:
         check()
-    except DamagedError as error:
+    except documents.DamagedError as error:
         raise ScenarioError("--resume", f"{path}: {error}", None, remedy) from None
 
 
@@ -178,9 +168,9 @@ def read_manifest(directory: Path, option: str = "--resume") -> dict[str, Any]:
     about an ``option`` if it is missing or damaged.
     """
     try:
-        manifest = read_document(directory / "manifest.json")
-        require_form(manifest, MANIFEST)
-    except DamagedError as error:
+        manifest = documents.read_document(directory / "manifest.json")
+        documents.require_form(manifest, MANIFEST)
+    except documents.DamagedError as error:
         rule = f"must be a directory that netkf run or plan left: manifest.json {error}"
         raise ScenarioError(option, rule, str(directory), "give another directory") from None
     return manifest

@@ -8,21 +8,9 @@ import numpy as np
 
 from netkf.checks.innovations import MIN_READINGS, Innovations, autocorrelations
 from netkf.core.errors import NetkfError
+from netkf.figures import style
 from netkf.figures.figure_data import FigureData, UnavailableError
 from netkf.figures.panels import draw_nees
-from netkf.figures.style import (
-    EXACT,
-    INK,
-    SECONDS,
-    SENSING,
-    SKY,
-    Picture,
-    draw_legend,
-    finish_figure,
-    label_text,
-    new_figure,
-    set_scale,
-)
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.summary import CONFIDENCE, NORMAL_QUANTILE, chi_square_interval, nees_bounds
 
@@ -32,7 +20,7 @@ WHITE_SHARE = 0.1
 """Largest share of autocorrelations outside their 95% band that is taken for white noise."""
 
 
-def nees_figure(data: FigureData) -> Picture:
+def nees_figure(data: FigureData) -> style.Picture:
     """Draw NEES over time with its interval if P is exact; raises UnavailableError."""
     data.require_samples()
     data.require_truth()
@@ -43,7 +31,7 @@ def nees_figure(data: FigureData) -> Picture:
     known = np.isfinite(values)
     if not known.any():
         raise UnavailableError("NEES is unavailable: it needs an error and a regular P.")
-    figure = new_figure(7.4, 4.2)
+    figure = style.new_figure(7.4, 4.2)
     draw_nees(figure.add_subplot(), data)
     inside = float(((values >= low) & (values <= high))[known].mean())
     divisor = f" over {data.runs:,} runs" if data.runs > 1 else ""
@@ -54,7 +42,7 @@ def nees_figure(data: FigureData) -> Picture:
     mean = float((values / unit)[known].mean())
     headline += f"{'is' if len(set(sizes)) == 1 else 'over n is'} {mean:.3g} where exact "
     headline += f"covariances give {n}"
-    return finish_figure(figure, data.title(headline), data.caption(note, notes="nees"))
+    return style.finish_figure(figure, data.title(headline), data.caption(note, notes="nees"))
 
 
 def require_innovations(data: FigureData) -> Innovations:
@@ -71,17 +59,17 @@ def require_innovations(data: FigureData) -> Innovations:
         raise UnavailableError(f"There are no innovations to draw: {error}.") from None
 
 
-def nis_figure(data: FigureData) -> Picture:
+def nis_figure(data: FigureData) -> style.Picture:
     """Draw the NIS of the readings over time, with its interval; raises UnavailableError."""
     innovations = require_innovations(data)
-    figure = new_figure(7.4, 4.2)
+    figure = style.new_figure(7.4, 4.2)
     share, mean = draw_nis(figure.add_subplot(), innovations)
     count = len(innovations.nis)
     headline = f"NIS per row of a reading is {mean:.3g} where exact covariances give 1; "
     headline += f"{share:.0%} of {count:,} readings lie in their {CONFIDENCE:.0%} interval"
     note = "Dots: single readings; line: means of bins, with the interval of each if P is exact."
     note += f" Readings: {read}." if (read := data.scenario.what_is_read(-1)) else ""
-    return finish_figure(figure, data.title(headline), data.caption(note))
+    return style.finish_figure(figure, data.title(headline), data.caption(note))
 
 
 def draw_nis(axes: Any, innovations: Innovations) -> tuple[float, float]:
@@ -90,8 +78,8 @@ def draw_nis(axes: Any, innovations: Innovations) -> tuple[float, float]:
     times, nis = innovations.times[finite], innovations.nis[finite]
     rows = innovations.rows[finite].astype(np.float64)  # degrees of freedom of each reading
     dots = np.linspace(0, len(nis) - 1, min(len(nis), MAX_DOTS)).astype(int)
-    style = {"ls": "", "marker": ".", "ms": 2.5, "color": SKY, "alpha": 0.7}
-    axes.plot(times[dots], (nis / rows)[dots], label="readings", **style)
+    looks = {"ls": "", "marker": ".", "ms": 2.5, "color": style.SKY, "alpha": 0.7}
+    axes.plot(times[dots], (nis / rows)[dots], label="readings", **looks)
     edges = np.linspace(0.0, max(float(times.max()), 1e-12), BINS + 1)
     bins = np.clip(np.digitize(times, edges[1:-1]), 0, BINS - 1)
     sums, freedom = (
@@ -102,21 +90,21 @@ def draw_nis(axes: Any, innovations: Innovations) -> tuple[float, float]:
     centres = 0.5 * (edges[1:] + edges[:-1])[has_readings]
     low, high = chi_square_interval(freedom[has_readings], CONFIDENCE)
     label = f"{CONFIDENCE:.0%} of means if P is exact"
-    axes.fill_between(centres, low, high, color=EXACT, alpha=0.25, lw=0, label=label)
+    axes.fill_between(centres, low, high, color=style.EXACT, alpha=0.25, lw=0, label=label)
     means = sums[has_readings] / freedom[has_readings]
-    axes.plot(centres, means, color=INK, lw=1.6, label="mean of each bin")
-    axes.axhline(1.0, color=EXACT, ls="-.", lw=1.1, label="expected")
-    set_scale(axes, np.concatenate([nis / rows, high]))
+    axes.plot(centres, means, color=style.INK, lw=1.6, label="mean of each bin")
+    axes.axhline(1.0, color=style.EXACT, ls="-.", lw=1.1, label="expected")
+    style.set_scale(axes, np.concatenate([nis / rows, high]))
     if axes.get_yscale() == "log":
         # Single NIS may be arbitrarily close to 0.
         axes.set_ylim(bottom=max(axes.get_ylim()[0], 1e-3))
-    axes.set(ylabel="NIS / rows of a reading", xlabel=SECONDS)
-    draw_legend(axes)
+    axes.set(ylabel="NIS / rows of a reading", xlabel=style.SECONDS)
+    style.draw_legend(axes)
     low, high = chi_square_interval(rows, CONFIDENCE)
     return float(((nis / rows >= low) & (nis / rows <= high)).mean()), float(nis.sum() / rows.sum())
 
 
-def whiteness_figure(data: FigureData) -> Picture:
+def whiteness_figure(data: FigureData) -> style.Picture:
     """Draw the autocorrelations of whitened innovations; raises UnavailableError."""
     innovations = require_innovations(data)
     curves, counts = autocorrelations(innovations)
@@ -131,7 +119,7 @@ def whiteness_figure(data: FigureData) -> Picture:
         for node, curve in curves.items()
     )
     worst = max(curves, key=lambda node: float(np.abs(curves[node]).max()))
-    figure = new_figure(7.4, 4.2)
+    figure = style.new_figure(7.4, 4.2)
     axes = figure.add_subplot()
     read = data.scenario.label_of_value(worst, 0, innovations.rows[innovations.nodes == worst])
     place = data.scenario.topology.index.get(worst)
@@ -143,7 +131,7 @@ def whiteness_figure(data: FigureData) -> Picture:
     )
     headline = f"{share:.0%} of autocorrelations are outside their 95% band, {judgement}"
     note = f"Band: 1.96 / root of {smallest:,}, the fewest readings of a node. Lags count readings."
-    return finish_figure(figure, data.title(headline), data.caption(note))
+    return style.finish_figure(figure, data.title(headline), data.caption(note))
 
 
 def _draw_correlations(
@@ -151,20 +139,20 @@ def _draw_correlations(
 ) -> None:
     """Draw autocorrelations (lags,) by node, the ``worst`` with its name, and the ``band``."""
     positions = np.arange(1, lags + 1)
-    axes.axhspan(-band, band, color=EXACT, alpha=0.2, lw=0, label="95% if white")
-    axes.axhline(0.0, color=EXACT, lw=0.8)
+    axes.axhspan(-band, band, color=style.EXACT, alpha=0.2, lw=0, label="95% if white")
+    axes.axhline(0.0, color=style.EXACT, lw=0.8)
     all_curves = np.array(list(curves.values()))
     if len(curves) > 1:
-        style: dict[str, Any] = {"color": SKY, "alpha": 0.35, "lw": 0}
+        looks: dict[str, Any] = {"color": style.SKY, "alpha": 0.35, "lw": 0}
         low, high = all_curves.min(axis=0), all_curves.max(axis=0)
-        axes.fill_between(positions, low, high, **style, label="range of all nodes")
+        axes.fill_between(positions, low, high, **looks, label="range of all nodes")
         mean = all_curves.mean(axis=0)
-        axes.plot(positions, mean, "-o", color=INK, ms=3.5, label="mean of all nodes")
+        axes.plot(positions, mean, "-o", color=style.INK, ms=3.5, label="mean of all nodes")
     node, name = worst
-    label = label_text(f"{name}, the largest" if len(curves) > 1 else name, 60)
-    axes.plot(positions, curves[node], "--s", color=SENSING, ms=3.5, label=label)
+    label = style.label_text(f"{name}, the largest" if len(curves) > 1 else name, 60)
+    axes.plot(positions, curves[node], "--s", color=style.SENSING, ms=3.5, label=label)
     axes.set(xlabel="lag, readings of the node", ylabel="autocorrelation of innovations")
     axes.xaxis.get_major_locator().set_params(integer=True)
     limit = max(1.3 * float(np.abs(all_curves).max()), 2.0 * band)
     axes.set_ylim(-limit, limit)
-    draw_legend(axes)
+    style.draw_legend(axes)

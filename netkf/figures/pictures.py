@@ -3,40 +3,33 @@
 from __future__ import annotations
 
 from netkf.ensembles.directory import FinishedEnsemble
+from netkf.figures import style
 from netkf.figures.figure_data import FigureData, reduce_completed_run, reduce_ensemble
 from netkf.figures.network import draw_network, error_label, explain_network, node_values
 from netkf.figures.panels import draw_covariances, draw_errors, draw_nees
-from netkf.figures.style import (
-    Picture,
-    draw_message,
-    finish_figure,
-    new_figure,
-    style_context,
-    write_figure,
-)
 from netkf.runs.run import CompletedRun
 from netkf.scenario.scenario import Scenario
 
 
 def run_picture(scenario: Scenario, completed: CompletedRun) -> None:
     """Write the overview of a run as ``run.png``; raises WriteError."""
-    with style_context():
+    with style.style_context():
         figure = overview(reduce_completed_run(scenario, completed))
-        write_figure(figure, completed.directory / "run.png")
+        style.write_figure(figure, completed.directory / "run.png")
 
 
 def ensemble_picture(scenario: Scenario, finished: FinishedEnsemble) -> None:
     """Write the overview of an ensemble as ``run.png``; raises WriteError."""
-    with style_context():
+    with style.style_context():
         figure = overview(reduce_ensemble(scenario, finished.ensemble, finished.promised))
-    write_figure(figure, finished.directory / "run.png")
+    style.write_figure(figure, finished.directory / "run.png")
 
 
-def overview(data: FigureData) -> Picture:
+def overview(data: FigureData) -> style.Picture:
     """Return four panels: errors, roots of trace P with bound and limits, NEES, and the network;
     without ground truth estimates, and no NEES.
     """
-    figure = new_figure(11.0, 8.2)
+    figure = style.new_figure(11.0, 8.2)
     drawings, heights = [draw_errors, draw_covariances], [1.0, 1.25]
     if data.shows_errors:
         drawings, heights = [*drawings, draw_nees], [1.0, 1.0]
@@ -47,13 +40,13 @@ def overview(data: FigureData) -> Picture:
         if len(data.times):
             draw(axes, data)
         else:
-            draw_message(axes, "there are no samples")
+            style.draw_message(axes, "there are no samples")
     key, label = error_label(data)
     draw_network(network, data, node_values(data, key), label)
     network.legend(loc="lower left", bbox_to_anchor=(0.0, 1.04), ncols=2, borderaxespad=0.2)
     scenario = data.scenario
     title = f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name
-    return finish_figure(
+    return style.finish_figure(
         figure, data.title(title), data.caption(*_caption_sentences(data), notes="both")
     )
 

@@ -10,21 +10,9 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError
 from netkf.core.printable import list_some, shorten
+from netkf.figures import style
 from netkf.figures.figure_data import FigureData, reduce_result
 from netkf.figures.names import SERIES
-from netkf.figures.style import (
-    MAX_DRAWN,
-    MUTED,
-    SECONDS,
-    Picture,
-    draw_legend,
-    finish_figure,
-    label_text,
-    message_figure,
-    new_figure,
-    set_scale,
-    style_context,
-)
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.curves import ErrorCurve
 from netkf.runs.summary import NORMAL_QUANTILE
@@ -37,28 +25,28 @@ BOUND = (0, (1, 1.5))
 NO_TRUTH = "None of them has a ground truth, so that their errors are unknown."
 
 
-def errors_figure(curves: Sequence[ErrorCurve], origin: str = "") -> Picture:
+def errors_figure(curves: Sequence[ErrorCurve], origin: str = "") -> style.Picture:
     """Draw mean square errors ``curves`` over time; ``origin`` begins the caption."""
     # A curve has the look of its place, whichever of the others have errors.
     placed = [(k, c) for k, c in enumerate(curves) if np.isfinite(c.square).any()]
     known = [c for _, c in placed]
-    with style_context():
+    with style.style_context():
         if not known:
-            return message_figure("No error to show", NO_TRUTH, [origin])
-        figure = new_figure(7.4, 4.6)
+            return style.message_figure("No error to show", NO_TRUTH, [origin])
+        figure = style.new_figure(7.4, 4.6)
         axes = figure.add_subplot()
         for k, curve in placed[:MAX_CURVES]:
             _draw_curve(axes, curve, k)
         central = {curve.central for curve in curves if math.isfinite(curve.central)}
         if len(central) == 1:
             label = "centralised filter, trace of P by theory"
-            axes.axhline(*central, color=MUTED, lw=0.9, ls=(0, (1, 2)), label=label)
+            axes.axhline(*central, color=style.MUTED, lw=0.9, ls=(0, (1, 2)), label=label)
         bounds = _draw_bounds(axes, placed[:MAX_CURVES])
         drawn = np.concatenate([*map(_high, known), *(c.square for c in known), *bounds])
         levels = [float(np.nanmedian(curve.square)) for curve in known[:MAX_CURVES]]
-        set_scale(axes, np.append(drawn, list(central)), levels)
-        axes.set(xlabel=SECONDS, ylabel=f"mean square error, squared {_unit(known)}")
-        draw_legend(axes)
+        style.set_scale(axes, np.append(drawn, list(central)), levels)
+        axes.set(xlabel=style.SECONDS, ylabel=f"mean square error, squared {_unit(known)}")
+        style.draw_legend(axes)
         sentences = [origin, "Mean over all nodes."]
         if any(curve.se is not None for curve in known):
             sentences.append("Bands: 95% intervals of the means over runs, or wider.")
@@ -69,22 +57,22 @@ def errors_figure(curves: Sequence[ErrorCurve], origin: str = "") -> Picture:
         missing = [shorten(c.label, MAX_LABEL) for c in curves if c not in known]
         if missing:
             sentences.append(f"Without errors: {list_some(missing, 6)}.")
-        return finish_figure(figure, _headline(known), [" ".join(filter(None, sentences))])
+        return style.finish_figure(figure, _headline(known), [" ".join(filter(None, sentences))])
 
 
 def _draw_curve(axes: Any, curve: ErrorCurve, k: int) -> None:
-    style, again = SERIES[k % len(SERIES)], k // len(SERIES)
-    label = label_text(curve.label, MAX_LABEL)
-    square = np.minimum(curve.square, MAX_DRAWN)
+    looks, again = SERIES[k % len(SERIES)], k // len(SERIES)
+    label = style.label_text(curve.label, MAX_LABEL)
+    square = np.minimum(curve.square, style.MAX_DRAWN)
     marks: dict[str, Any] = {"marker": SERIES[again].marker, "ms": 3.5} if again else {}
     marks |= {"markevery": max(1, len(square) // 12)} if again else {}
-    alone = {"marker": style.marker, "ms": 4} if len(square) == 1 else {}
+    alone = {"marker": looks.marker, "ms": 4} if len(square) == 1 else {}
     axes.plot(
-        curve.times, square, color=style.colour, ls=style.dashes, label=label, **marks | alone
+        curve.times, square, color=looks.colour, ls=looks.dashes, label=label, **marks | alone
     )
     if curve.se is not None:
         low, high = np.maximum(square - NORMAL_QUANTILE * curve.se, 0.0), _high(curve)
-        axes.fill_between(curve.times, low, high, color=style.colour, alpha=0.15, lw=0)
+        axes.fill_between(curve.times, low, high, color=looks.colour, alpha=0.15, lw=0)
 
 
 def _draw_bounds(axes: Any, placed: Sequence[tuple[int, ErrorCurve]]) -> list[FloatArray]:
@@ -92,24 +80,24 @@ def _draw_bounds(axes: Any, placed: Sequence[tuple[int, ErrorCurve]]) -> list[Fl
     bounds = []
     for k, curve in placed:
         if curve.bound is not None:
-            bounds.append(np.minimum(curve.bound, MAX_DRAWN))
+            bounds.append(np.minimum(curve.bound, style.MAX_DRAWN))
             colour = SERIES[k % len(SERIES)].colour
             axes.plot(curve.times, bounds[-1], color=colour, ls=BOUND, lw=0.9)
     if bounds:
         label = "in its colour: bound on the mean trace of P"
-        axes.plot([], [], color=MUTED, ls=BOUND, lw=0.9, label=label)
+        axes.plot([], [], color=style.MUTED, ls=BOUND, lw=0.9, label=label)
     return bounds
 
 
 def _unit(curves: Sequence[ErrorCurve]) -> str:
     units = {curve.unit for curve in curves}
-    return label_text(units.pop() if len(units) == 1 else "units of the state")
+    return style.label_text(units.pop() if len(units) == 1 else "units of the state")
 
 
 def _high(curve: ErrorCurve) -> FloatArray:
     """Return the upper ends (T,) of a curve's intervals, or the curve itself."""
     width = 0.0 if curve.se is None else NORMAL_QUANTILE * curve.se
-    return np.minimum(curve.square + width, MAX_DRAWN)
+    return np.minimum(curve.square + width, style.MAX_DRAWN)
 
 
 def _headline(curves: Sequence[ErrorCurve]) -> str:

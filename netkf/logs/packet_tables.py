@@ -15,20 +15,7 @@ from netkf.core.csv_files import MAX_ID
 from netkf.core.errors import ScenarioError
 from netkf.core.printable import count_phrase
 from netkf.linalg.arrays import FloatArray
-from netkf.logs.packets import (
-    MAX_SKIP,
-    PacketLog,
-    choose_origin,
-    find_lead,
-    find_resolution,
-    note_count,
-    parse_numbers,
-    parse_stamps,
-    read_text_rows,
-    refuse_rows,
-    spread_equal,
-    unwrap,
-)
+from netkf.logs import packets
 
 SYNONYMS = {
     "t": (
@@ -76,20 +63,20 @@ class _Rows(NamedTuple):
     arrivals: list[Decimal | None]
 
 
-def read_tables(log: Path, columns: Mapping[str, str]) -> PacketLog:
+def read_tables(log: Path, columns: Mapping[str, str]) -> packets.PacketLog:
     """Return the packet log of a table, or of a folder: packets.csv, or all tables but EXTRAS;
     ``columns`` has names of columns by names in SYNONYMS. Raises ScenarioError.
     """
     notes: list[str] = []
-    tables = _rename({path: read_text_rows(path) for path in _packet_paths(log)}, columns)
+    tables = _rename({path: packets.read_text_rows(path) for path in _packet_paths(log)}, columns)
     parts = [_read_rows(path, raw, notes) for path, raw in tables.items()]
     stamps = [stamp for part in parts for stamp in part.stamps]
     arrivals = [arrival for part in parts for arrival in part.arrivals]
     extras = {name: find_extra(log, name) for name in EXTRAS}
-    resolution = find_resolution(stamps)
+    resolution = packets.find_resolution(stamps)
     # A run counts from 0.
     is_run = (log / "scenario.toml").is_file()
-    origin = Decimal(0) if is_run else choose_origin(stamps, resolution)
+    origin = Decimal(0) if is_run else packets.choose_origin(stamps, resolution)
     table = pd.concat([part.table for part in parts], ignore_index=True)
     table["t"] = [float(stamp - origin) for stamp in stamps]
     falls = -np.minimum(np.diff(table["t"]), 0.0)
@@ -109,7 +96,7 @@ def read_tables(log: Path, columns: Mapping[str, str]) -> PacketLog:
     if not is_run and (first := float(sends["t"].min())) <= 0.0:  # clocks were aligned
         sends["t"] += 1.0 - first // 1.0
         origin -= Decimal(int(1.0 - first // 1.0))
-    result = PacketLog(sends, outcomes, origin, resolution, "lost", notes, is_run=is_run)
+    result = packets.PacketLog(sends, outcomes, origin, resolution, "lost", notes, is_run=is_run)
     if is_run and (log / "ticks.csv").is_file():
         result.ticks = log / "ticks.csv"
     if is_export:
@@ -194,18 +181,23 @@ def _read_rows(path: Path, raw: pd.DataFrame, notes: list[str]) -> _Rows:
         }
     )
     sender, remedy = table["sender"], "correct the row"
-    refuse_rows(path, sender, sender == "", "must name a sender", remedy, quoted=False)
+    packets.refuse_rows(path, sender, sender == "", "must name a sender", remedy, quoted=False)
     missing = np.full(len(raw), np.nan)
     for name in ("number", "rssi"):
         column = names[name]
-        table[name] = parse_numbers(path, raw, column, gaps=True) if column else missing
+        table[name] = packets.parse_numbers(path, raw, column, gaps=True) if column else missing
     is_count = (table["number"] % 1.0 == 0.0) & table["number"].between(0.0, MAX_ID)
     if names["number"]:
         rule, remedy = "number must be an integer from 0 to 2^53", "count from less"
         wrong = ~is_count & table["number"].notna()
-        refuse_rows(path, raw[names["number"]], wrong, rule, f"correct the entry, or {remedy}")
+        packets.refuse_rows(
+            path, raw[names["number"]], wrong, rule, f"correct the entry, or {remedy}"
+        )
     table["what"], table["heard"] = _read_outcomes(path, raw, names, table)
-    stamps, arrivals = parse_stamps(path, raw, names["t"], notes), _read_arrivals(path, raw, names)
+    stamps, arrivals = (
+        packets.parse_stamps(path, raw, names["t"], notes),
+        _read_arrivals(path, raw, names),
+    )
     has_receiver = (table["receiver"] != "").to_numpy()
     is_lost = has_receiver & np.array([arrival is None for arrival in arrivals])
     tells = names["t_heard"] and not (names["heard"] or names["event"])
@@ -264,7 +256,7 @@ def _read_arrivals(path: Path, raw: pd.DataFrame, names: dict[str, str]) -> list
         return arrivals
     is_open = raw[column].str.lower().isin(["inf", "infinity"])
     has = ~raw[column].str.lower().isin(NO_STAMP) & ~is_open
-    stamps = iter(parse_stamps(path, raw[has], column))
+    stamps = iter(packets.parse_stamps(path, raw[has], column))
     return [
         next(stamps) if a else Decimal("Infinity") if b else None
         for a, b in zip(has, is_open, strict=True)
@@ -284,7 +276,9 @@ def _read_outcomes(
         groups = [column.isin(group).to_numpy() for group in words]
         wrong = ~(groups[0] | groups[1] | groups[2] | column.isin(UNKNOWN).to_numpy())
         choices = "what happened (tx, rx or lost)" if name == "event" else "1 or 0"
-        refuse_rows(path, column, wrong, f"{names[name]} must say {choices}", "correct the entry")
+        packets.refuse_rows(
+            path, column, wrong, f"{names[name]} must say {choices}", "correct the entry"
+        )
         heard = np.select([groups[1], groups[2]], [1.0, 0.0], np.nan)
         if name == "event":
             what[groups[0]] = "tx"
@@ -293,8 +287,8 @@ def _read_outcomes(
             what[(table["receiver"] != "").to_numpy()] = "outcome"
     sender, receiver, remedy = table["sender"], table["receiver"], "correct the row"
     alone = (what != "tx") & (receiver == "")
-    refuse_rows(path, receiver, alone, "must name a receiver", remedy, quoted=False)
-    refuse_rows(path, sender, receiver == sender, "sender and receiver must differ", remedy)
+    packets.refuse_rows(path, receiver, alone, "must name a receiver", remedy, quoted=False)
+    packets.refuse_rows(path, sender, receiver == sender, "sender and receiver must differ", remedy)
     return what, heard
 
 
@@ -321,7 +315,7 @@ def _match(
         )
     _order_stamps(sends, notes)
     sends = sends.sort_values(["t", "counter"], kind="stable")
-    spread_equal(sends, resolution, notes)
+    packets.spread_equal(sends, resolution, notes)
     skipped = _skipped(sends, notes)
     if len(skipped):  # an empty table has no types
         sends = pd.concat([sends, skipped])
@@ -351,7 +345,7 @@ def _number_transmissions(table: pd.DataFrame, notes: list[str], log: str) -> pd
         own = rows.sort_values(["t", "number"], kind="stable")
         known = own[own["number"].notna()]
         missing += len(own) - len(known)
-        found = unwrap(known["number"].to_numpy().astype(np.int64), known["t"].to_numpy())
+        found = packets.unwrap(known["number"].to_numpy().astype(np.int64), known["t"].to_numpy())
         if found[3] > max(3, len(np.unique(found[0])) // 10):
             wrong = wrong or (
                 f"numbers of {sender} begin again {found[3]} times: stamps do not fit each other"
@@ -375,9 +369,9 @@ def _number_transmissions(table: pd.DataFrame, notes: list[str], log: str) -> pd
         lengths = " or ".join(map(str, sorted(moduli)))
         notes.append(f"used: numbers wrap after {lengths}: {count_phrase(wraps, 'time')}")
     text = "used: numbers begin again {}; what was sent between is not known"
-    note_count(notes, restarts, "time", text)
+    packets.note_count(notes, restarts, "time", text)
     text = "used: {} without a number: equal stamps of a sender are one packet"
-    note_count(notes, missing, "row", text)
+    packets.note_count(notes, missing, "row", text)
     return keys
 
 
@@ -396,7 +390,7 @@ def _align_clocks(table: pd.DataFrame, notes: list[str]) -> None:
     moved: list[float] = []
     for _, rows in reports.groupby(["sender", "to"], sort=True):
         names, codes = np.unique(who[rows.index].astype(str), return_inverse=True)
-        lead = find_lead(rows["number"].to_numpy(), rows["t"].to_numpy(), codes)
+        lead = packets.find_lead(rows["number"].to_numpy(), rows["t"].to_numpy(), codes)
         lead -= 0.0 if names[0] == "" else lead.max()
         if lead.any():
             table.loc[rows.index, "t"] = (rows["t"] - lead).round(9)
@@ -440,7 +434,7 @@ def _skipped(sends: pd.DataFrame, notes: list[str]) -> pd.DataFrame:
         moves = sum(a != b for a, b in pairwise(channels)) > RARE * len(channels)
         for k in np.flatnonzero(np.diff(counters) > 1).tolist():
             count = int(counters[k + 1] - counters[k])
-            if count > MAX_SKIP:
+            if count > packets.MAX_SKIP:
                 left_out += count - 1
                 continue
             for j in range(1, count):
@@ -452,9 +446,9 @@ def _skipped(sends: pd.DataFrame, notes: list[str]) -> pd.DataFrame:
                 row |= {"counter": counter, "sent": False, "logged": False}
                 found.append(row)
     text = "that numbers tell of and no row does; they stand between their neighbours in time"
-    note_count(notes, len(found), "transmission", "not known: {} " + text)
-    text = f"between numbers more than {MAX_SKIP:,} apart; these are not in the replay"
-    note_count(notes, left_out, "transmission", "not known: {} " + text)
+    packets.note_count(notes, len(found), "transmission", "not known: {} " + text)
+    text = f"between numbers more than {packets.MAX_SKIP:,} apart; these are not in the replay"
+    packets.note_count(notes, left_out, "transmission", "not known: {} " + text)
     columns = ["sender", "t", "channel", "to", "counter", "sent", "logged"]
     keys = [_key(row["sender"], row["to"], row["counter"]) for row in found]
     return pd.DataFrame(found, columns=columns, index=keys)
@@ -493,7 +487,7 @@ def _merge_rows(rows: pd.DataFrame, notes: list[str], log: str) -> pd.DataFrame:
 
 def read_log_positions(path: Path, origin: Decimal, notes: list[str]) -> pd.DataFrame:
     """Return node, x, y, or t (s from ``origin``), node, x, y where nodes move (ScenarioError)."""
-    raw = read_text_rows(path)
+    raw = packets.read_text_rows(path)
     stamp, name = find_column(raw, "t"), find_column(raw, "node") or raw.columns[0]
     columns = {}
     for axis in ("x", "y"):
@@ -501,8 +495,8 @@ def read_log_positions(path: Path, origin: Decimal, notes: list[str]) -> pd.Data
         if not column:
             rule = f"must have a column {axis}"
             raise ScenarioError(str(path), rule, list(raw.columns), "name the columns")
-        columns[axis] = parse_numbers(path, raw, column)
-    stamps = parse_stamps(path, raw, stamp) if stamp else [origin] * len(raw)
+        columns[axis] = packets.parse_numbers(path, raw, column)
+    stamps = packets.parse_stamps(path, raw, stamp) if stamp else [origin] * len(raw)
     times = [float(s - origin) for s in stamps]
     table = pd.DataFrame({"t": times, "node": raw[name].to_numpy(), **columns}, index=raw.index)
     for (_, node), rows in table.drop_duplicates(["t", "node", "x", "y"]).groupby(["t", "node"]):
@@ -511,28 +505,28 @@ def read_log_positions(path: Path, origin: Decimal, notes: list[str]) -> pd.Data
             rule = f"lines {rows.index[0]} and {rows.index[1]}: a node must have {what}"
             raise ScenarioError(str(path), rule, str(node), "correct one of the two rows")
     kept = table.drop_duplicates(["t", "node"]).sort_values(["t", "node"], kind="stable")
-    note_count(notes, len(table) - len(kept), "row", "merged: {} of " + path.name)
+    packets.note_count(notes, len(table) - len(kept), "row", "merged: {} of " + path.name)
     # The first place of a node that was placed later counts from the beginning.
     late = (kept["t"] > 0.0) & ~kept.duplicated("node")
-    note_count(notes, late.sum(), "node", "moved: first places of {} to time 0")
+    packets.note_count(notes, late.sum(), "node", "moved: first places of {} to time 0")
     kept["t"] = kept["t"].where(~late, 0.0)
     return kept.reset_index(drop=True) if stamp else kept.drop(columns="t")
 
 
 def read_readings(path: Path, origin: Decimal, notes: list[str]) -> pd.DataFrame:
     """Return t (s from ``origin``), node, y0, the first other column; raises ScenarioError."""
-    raw = read_text_rows(path)
+    raw = packets.read_text_rows(path)
     stamp, node = find_column(raw, "t"), find_column(raw, "node") or find_column(raw, "sender")
     rest = [name for name in raw.columns if name not in (stamp, node)]
     if not stamp or not node or not rest:
         rule = "must have columns t, node and y0"
         raise ScenarioError(str(path), rule, list(raw.columns), "name the columns")
-    stamps, (used, *unused) = parse_stamps(path, raw, stamp), rest
+    stamps, (used, *unused) = packets.parse_stamps(path, raw, stamp), rest
     table = pd.DataFrame({"t": [float(s - origin) for s in stamps], "node": raw[node].to_numpy()})
-    table["y0"] = parse_numbers(path, raw, used, gaps=True)
+    table["y0"] = packets.parse_numbers(path, raw, used, gaps=True)
     if unused:
         notes.append(f"not used: {path.name}: columns {', '.join(unused)}, but {used} as y0")
     is_empty, is_early = table["y0"].isna(), table["t"] < 0.0
-    note_count(notes, is_empty.sum(), "reading", "dropped: {} without a value")
-    note_count(notes, (is_early & ~is_empty).sum(), "reading", "dropped: {} before time 0")
+    packets.note_count(notes, is_empty.sum(), "reading", "dropped: {} without a value")
+    packets.note_count(notes, (is_early & ~is_empty).sum(), "reading", "dropped: {} before time 0")
     return table[~(is_empty | is_early)].reset_index(drop=True)

@@ -14,24 +14,15 @@ import pandas as pd
 
 from netkf.core.errors import ScenarioError
 from netkf.core.printable import count_phrase
+from netkf.logs import packets
 from netkf.logs.packet_tables import find_column, find_extra, read_log_positions, read_readings
-from netkf.logs.packets import (
-    PacketLog,
-    find_resolution,
-    note_count,
-    parse_numbers,
-    parse_stamps,
-    read_text_rows,
-    refuse_rows,
-    spread_equal,
-)
 
 MINUTE = 60.0
 EARLY = 10.0
 """A minute's reports begin up to so many seconds before it."""
 
 
-def read_ulb(log: Path) -> PacketLog:
+def read_ulb(log: Path) -> packets.PacketLog:
     """Return the packet log of a folder with readings.csv and heard.csv; raises ScenarioError."""
     paths = {}
     for name in ("readings", "heard"):
@@ -42,9 +33,9 @@ def read_ulb(log: Path) -> PacketLog:
         paths[name] = path
     notes: list[str] = []
     raw = _read_named(paths["heard"], ("t", "sender", "receiver"))
-    stamps = parse_stamps(paths["heard"], raw, find_column(raw, "t"))
+    stamps = packets.parse_stamps(paths["heard"], raw, find_column(raw, "t"))
     texts = _read_named(paths["readings"], ("t", "node"))
-    read_stamps = parse_stamps(paths["readings"], texts, find_column(texts, "t"))
+    read_stamps = packets.parse_stamps(paths["readings"], texts, find_column(texts, "t"))
     first = min(*stamps, *read_stamps)
     origin = Decimal(int(first // 60) * 60)  # minutes stay those of the stamps
     readings = read_readings(paths["readings"], origin, notes)
@@ -54,7 +45,7 @@ def read_ulb(log: Path) -> PacketLog:
             "t": [float(stamp - origin) for stamp in stamps],
             "sender": raw[find_column(raw, "sender")],
             "receiver": raw[find_column(raw, "receiver")],
-            "rssi": parse_numbers(paths["heard"], raw, lqi, gaps=True) if lqi else np.nan,
+            "rssi": packets.parse_numbers(paths["heard"], raw, lqi, gaps=True) if lqi else np.nan,
         }
     )
     reports["minute"] = ((reports["t"] + EARLY) // MINUTE).astype(int) - 1
@@ -65,14 +56,14 @@ def read_ulb(log: Path) -> PacketLog:
     kept = reports.drop_duplicates(["sender", "receiver", "minute"])
     kept = kept[kept["sender"] != kept["receiver"]]
     text = "merged: {} of reports that name a sender again, or the mote itself"
-    note_count(notes, len(reports) - len(kept), "row", text)
+    packets.note_count(notes, len(reports) - len(kept), "row", text)
     sends = _broadcasts(readings, kept, notes)
-    spread_equal(sends, find_resolution(read_stamps), notes)
+    packets.spread_equal(sends, packets.find_resolution(read_stamps), notes)
     sends = sends.sort_values("t", kind="stable").reset_index(drop=True)
     outcomes = _outcomes(sends, kept, notes)
     sends = sends[["sender", "t", "channel", "to", "sent", "logged"]]
-    resolution = find_resolution([*stamps, *read_stamps])
-    result = PacketLog(sends, outcomes, origin, resolution, "unknown", notes)
+    resolution = packets.find_resolution([*stamps, *read_stamps])
+    result = packets.PacketLog(sends, outcomes, origin, resolution, "unknown", notes)
     result.readings = readings
     places = find_extra(log, "positions")
     if places is not None:
@@ -82,14 +73,14 @@ def read_ulb(log: Path) -> PacketLog:
 
 def _read_named(path: Path, names: tuple[str, ...]) -> pd.DataFrame:
     """Return a table of texts that has the columns ``names``, motes among them in every row."""
-    table = read_text_rows(path)
+    table = packets.read_text_rows(path)
     for name in names:
         column = find_column(table, name)
         if not column:
             rule = f"must have a column {name}"
             raise ScenarioError(str(path), rule, list(table.columns), "check the file")
         blank, rule = (table[column] == "") & (name != "t"), f"must name a {name}"
-        refuse_rows(path, table[column], blank, rule, "correct the row", quoted=False)
+        packets.refuse_rows(path, table[column], blank, rule, "correct the row", quoted=False)
     return table
 
 
@@ -105,9 +96,9 @@ def _broadcasts(readings: pd.DataFrame, reports: pd.DataFrame, notes: list[str])
     extra = named[named["_merge"] == "left_only"][["sender", "minute"]]
     extra["t"] = (MINUTE * extra["minute"] + extra["sender"].map(usual).astype(float)).round(3)
     text = "used: {} without a reading, which reports name, at the usual second of the mote"
-    note_count(notes, len(extra), "broadcast", text)
+    packets.note_count(notes, len(extra), "broadcast", text)
     again = len(readings) - len(sends)
-    note_count(notes, again, "reading", "merged: {} in a minute that has one already")
+    packets.note_count(notes, again, "reading", "merged: {} in a minute that has one already")
     both = pd.concat([sends, extra], ignore_index=True)
     at_zero = both["t"] == 0.0
     if at_zero.any():
@@ -126,8 +117,8 @@ def _outcomes(sends: pd.DataFrame, reports: pd.DataFrame, notes: list[str]) -> p
     is_told = pd.MultiIndex.from_frame(whole[["receiver", "minute"]]).isin(told)
     whole["heard"] = np.where(is_told, whole["heard"].fillna(0.0), np.nan)
     text = "not known: {} in minutes of which the receiver's report is missing"
-    note_count(notes, whole["heard"].isna().sum(), "outcome", text)
+    packets.note_count(notes, whole["heard"].isna().sum(), "outcome", text)
     unused = len(reports) - int((whole["heard"] == 1.0).sum())
     text = "dropped: {} of reports on motes or minutes without a broadcast"
-    note_count(notes, unused, "row", text)
+    packets.note_count(notes, unused, "row", text)
     return whole[["send", "receiver", "heard", "rssi"]].assign(delay=np.nan)

@@ -19,17 +19,9 @@ from netkf.engines.base import Engine, Progress, silent
 from netkf.linalg import compiling
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.rng.streams import Streams
+from netkf.runs import files
 from netkf.runs.documents import file_digests, write_sealed
 from netkf.runs.failures import explain_failure
-from netkf.runs.files import (
-    check_sources,
-    create_output_directory,
-    require_run,
-    run_file_names,
-    scenario_digest,
-    write_json,
-    write_scenario,
-)
 from netkf.runs.parquet_files import ParquetSink
 from netkf.runs.provenance import machine, versions
 from netkf.runs.quantities import NetworkSink
@@ -119,7 +111,7 @@ def run_to_directory(
             raise
         raise explained from error
     totals = _event_totals(recorder.total, str(output.fingerprint), recorder.stats)
-    output.manifest.write(status, totals, is_complete, names=run_file_names(scenario))
+    output.manifest.write(status, totals, is_complete, names=files.run_file_names(scenario))
     return completed
 
 
@@ -135,9 +127,9 @@ def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
     """
     require_scenario(scenario, "save", ", directory")
     directory = as_path("directory", directory)
-    known = require_run(run)
+    known = files.require_run(run)
     # A run may have another seed than its scenario, which scenario.toml of a directory then has.
-    if len({scenario_digest(one, seed=run.seed) for one in {known, scenario}}) > 1:
+    if len({files.scenario_digest(one, seed=run.seed) for one in {known, scenario}}) > 1:
         rule = "must be a run of this scenario: their keys or files differ"
         raise ScenarioError("run", rule, run, "save it with run.scenario")
     output = _create_output(scenario, directory, run.seed, run.replica, run.engine, tables=True)
@@ -149,7 +141,7 @@ def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
     output.write_summary(promise_traces(scenario, run.times), run.count, run.sums, run.status)
     totals = _event_totals(len(run.log), run.fingerprint, run.stats)
     is_complete = run.status == "complete"
-    output.manifest.write(run.status, totals, is_complete, names=run_file_names(scenario))
+    output.manifest.write(run.status, totals, is_complete, names=files.run_file_names(scenario))
     return output.directory
 
 
@@ -208,21 +200,21 @@ class _Output:
                 summary["held_out"] = errors_of_replica(
                     self.scenario, manifest.seed, manifest.replica
                 )
-        write_json(self.directory / "summary.json", summary)
+        files.write_json(self.directory / "summary.json", summary)
         return summary
 
 
 def _create_output(
     scenario: Scenario, out: Path | None, seed: int, replica: int, engine: str, tables: bool
 ) -> _Output:
-    check_sources(scenario)
-    directory = create_output_directory(out, scenario.name)
+    files.check_sources(scenario)
+    directory = files.create_output_directory(out, scenario.name)
     channel = scenario.network.channel
     is_recorded = isinstance(channel.loss, RecordedLoss) or isinstance(channel.delay, RecordedDelay)
     manifest = Manifest.of(scenario, directory, engine, seed=seed, replica=replica)
     # Written first, so that the directory of a process that is killed says "interrupted".
     manifest.write("interrupted", {})
-    write_scenario(directory, scenario, seed)
+    files.write_scenario(directory, scenario, seed)
     samples = SummarySink()
     wanted = scenario.metrics.network is not False
     return _Output(

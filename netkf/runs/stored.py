@@ -12,19 +12,7 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray, from_upper
 from netkf.network.graphs import name_rows
-from netkf.runs.documents import (
-    COUNT,
-    NUMBER,
-    SEAL,
-    TEXT,
-    TEXTS,
-    DamagedError,
-    add_file_name,
-    check_files,
-    check_seal,
-    read_document,
-    require_form,
-)
+from netkf.runs import documents
 from netkf.runs.parquet_files import column_names, read_numbers, read_texts
 from netkf.runs.summary import PromisedTraces, promise_traces
 from netkf.runs.tables import COLUMNS
@@ -36,30 +24,32 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _OPTIONAL = ("rms_error_se?", "mean_sq_error?", "mean_sq_error_se?", "mean_trace_se?", "bound_se?")
-AVERAGES_FORM: dict[str, Any] = dict.fromkeys((*COLUMNS, *_OPTIONAL, "mean_nees_se?"), NUMBER)
+AVERAGES_FORM: dict[str, Any] = dict.fromkeys(
+    (*COLUMNS, *_OPTIONAL, "mean_nees_se?"), documents.NUMBER
+)
 """Forms of JSON values, see documents.require_form."""
 MESSAGES = ("sent", "delivered", "lost")
 SUMMARY_FORM: dict[str, Any] = {
-    "nodes": [{"node": COUNT, **AVERAGES_FORM}],
+    "nodes": [{"node": documents.COUNT, **AVERAGES_FORM}],
     "overall": AVERAGES_FORM,
-    **dict.fromkeys(("limit", "central", "rounding_from?"), NUMBER),
-    "bound": TEXT,
-    "notes": TEXTS,
-    "messages": {**dict.fromkeys(MESSAGES, NUMBER), "in_flight?": NUMBER},
-    "messages_se?": {f"{name}?": NUMBER for name in MESSAGES},
+    **dict.fromkeys(("limit", "central", "rounding_from?"), documents.NUMBER),
+    "bound": documents.TEXT,
+    "notes": documents.TEXTS,
+    "messages": {**dict.fromkeys(MESSAGES, documents.NUMBER), "in_flight?": documents.NUMBER},
+    "messages_se?": {f"{name}?": documents.NUMBER for name in MESSAGES},
 }
 MANIFEST_FORM: dict[str, Any] = {
-    "name": TEXT,
-    "status": TEXT,
-    "seed": COUNT,
-    "replica?": COUNT,
-    "engine?": TEXT,
-    "events?": COUNT,
-    "fingerprint?": TEXT,
-    "runs": {"wanted": COUNT, "done": COUNT},
+    "name": documents.TEXT,
+    "status": documents.TEXT,
+    "seed": documents.COUNT,
+    "replica?": documents.COUNT,
+    "engine?": documents.TEXT,
+    "events?": documents.COUNT,
+    "fingerprint?": documents.TEXT,
+    "runs": {"wanted": documents.COUNT, "done": documents.COUNT},
     "simpy?": {},
     "versions?": {},
-    "error?": TEXT,
+    "error?": documents.TEXT,
 }
 TABLE_FILES = ("states.parquet", "events.parquet")
 
@@ -129,11 +119,11 @@ def read_checked_document(directory: Path, name: str, form: Mapping[str, Any]) -
     """Return the JSON document ``name`` of a directory; raises DamagedError without the keys and
     types of ``form``, or if its seal (a digest of its other entries) does not fit.
     """
-    with add_file_name(name):
-        document = read_document(directory / name)
-        require_form(document, dict(form))
-        if SEAL in document:
-            check_seal(document)
+    with documents.add_file_name(name):
+        document = documents.read_document(directory / name)
+        documents.require_form(document, dict(form))
+        if documents.SEAL in document:
+            documents.check_seal(document)
     return document
 
 
@@ -143,7 +133,7 @@ def read_run(
     """Return the run in a directory, or one recorded ``replica`` of an ensemble; the ``manifest``
     has MANIFEST_FORM. Raises DamagedError.
     """
-    check_files(directory, manifest, [*TABLE_FILES, "summary.json"])
+    documents.check_files(directory, manifest, [*TABLE_FILES, "summary.json"])
     summary = read_checked_document(directory, "summary.json", SUMMARY_FORM)
     name_rows(summary["nodes"])
     # In the directory of an ensemble the manifest and the summary are about all of its runs.
@@ -153,9 +143,11 @@ def read_run(
     states, arrays = _read_states(directory / "states.parquet", scenario, replica)
     log = _read_events(directory / "events.parquet", scenario, replica)
     conserved = summary.get("conserved", {}) if is_single_run else {}
-    require_form(conserved, {}, "conserved")
+    documents.require_form(conserved, {}, "conserved")
     for name, entry in conserved.items():
-        require_form(entry, {"exact": NUMBER, "total": NUMBER}, f"conserved.{name}")
+        documents.require_form(
+            entry, {"exact": documents.NUMBER, "total": documents.NUMBER}, f"conserved.{name}"
+        )
     ended = "diverged" if (log["kind"] == CODES["diverged"]).any() else "complete"
     return StoredRun(
         **arrays,
@@ -187,7 +179,7 @@ def _read_states(
         names = names[:-2]  # without sq_error and nees
     if path.exists():
         if column_names(path) != names:
-            raise DamagedError(f"{path.name} does not have the columns of this scenario")
+            raise documents.DamagedError(f"{path.name} does not have the columns of this scenario")
         table = read_numbers(path, names, replica, allow_empty=True)
     else:
         table = pd.DataFrame({name: np.empty(0) for name in names})
@@ -200,7 +192,7 @@ def _read_states(
         and (np.diff(times) > 0).all()
     )
     if not has_all_rows:
-        raise DamagedError(f"{path.name} does not have a row for each time and node")
+        raise documents.DamagedError(f"{path.name} does not have a row for each time and node")
     # After run, t and node: x, xhat and the upper triangle of P, row by row.
     values = table[names[3:]].to_numpy(dtype=np.float64).reshape(T, N, len(names) - 3)
     seen, xhat = values[:, :, :n], values[:, :, n : 2 * n]
@@ -225,16 +217,18 @@ def _read_events(path: Path, scenario: Scenario, replica: int) -> np.ndarray:
     kinds = read_texts(path, "kind", replica)
     codes = kinds.cat.categories.map(CODES)
     if codes.hasnans:
-        raise DamagedError(f"{path.name} has events of an unknown kind")
+        raise documents.DamagedError(f"{path.name} has events of an unknown kind")
     rows = np.empty(len(table), dtype=EVENT)
     for name in columns:
         if EVENT[name].kind == "i" and table[name].dtype.kind != "i":
-            raise DamagedError(f"{path.name} has no column {name} of integers")
+            raise documents.DamagedError(f"{path.name} has no column {name} of integers")
         rows[name] = table[name]
     rows["kind"] = np.asarray(codes, dtype=np.uint8)[kinds.cat.codes]
     nodes = [-1, *scenario.nodes]  # -1: the event has no node, or no peer
     if not (np.isin(rows["node"], nodes).all() and np.isin(rows["peer"], nodes).all()):
-        raise DamagedError(f"{path.name} has events of nodes that the scenario does not have")
+        raise documents.DamagedError(
+            f"{path.name} has events of nodes that the scenario does not have"
+        )
     if not np.isfinite(rows["t"]).all() or (np.diff(rows["t"]) < 0.0).any():
-        raise DamagedError(f"{path.name} has events out of order")
+        raise documents.DamagedError(f"{path.name} has events out of order")
     return rows

@@ -26,6 +26,7 @@ from netkf.plants.diffusion import Diffusion
 from netkf.plants.inputs import Input
 from netkf.plants.maps import NonlinearPlant
 from netkf.plants.regressors import RegressorSensor
+from netkf.scenario import shapes
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.model import takes_samples
 from netkf.scenario.positions import check_positions
@@ -38,14 +39,6 @@ from netkf.scenario.preconditions import (
 from netkf.scenario.records import check_records
 from netkf.scenario.registry import explain_time_mismatch, kind_name
 from netkf.scenario.sampling import check_sampling, uses_grid
-from netkf.scenario.shapes import (
-    check_changes_on_grid,
-    check_nonlinear,
-    check_regressor,
-    check_schedule,
-    check_weights,
-    require_shape,
-)
 from netkf.scenario.time_grid import check_grid
 
 MAX_SAMPLES = 10_000_000  # state samples of one run
@@ -132,20 +125,20 @@ def _check_plant(scenario: DerivedScenario) -> None:
             one.check_names()
     if isinstance(plant, Diffusion):
         why = f"plant.A has {n} rows"
-        require_shape("plant.B", plant.B, (n, None), why)
+        shapes.require_shape("plant.B", plant.B, (n, None), why)
     elif not plant.linear:
         why = f"plant.{'Q' if scenario.slotted else 'B'} has {n} rows"
     else:
         why = f"plant.F has {n} rows"
-        require_shape("plant.Q", scenario.slot_plant.Q, (n, n), why)
-    check_schedule(scenario, why)
+        shapes.require_shape("plant.Q", scenario.slot_plant.Q, (n, n), why)
+    shapes.check_schedule(scenario, why)
     if isinstance(plant, NonlinearPlant | NonlinearDiffusion):
         with errors_under("plant"):
             plant.check_dynamics()
     if plant.mean is not None:
-        require_shape("plant.mean", plant.mean, (n,), why)
+        shapes.require_shape("plant.mean", plant.mean, (n,), why)
     if plant.cov is not None:
-        require_shape("plant.cov", plant.cov, (n, n), why)
+        shapes.require_shape("plant.cov", plant.cov, (n, n), why)
     if plant.input is not None and plant.linear:
         _check_input(plant.input, n)
 
@@ -157,7 +150,7 @@ def _check_input(u: Input, n: int) -> None:
     if u.G is None:
         raise ScenarioError("plant.input.G", "is missing", None, f"add G = ..., {n} rows of {m}")
     parts = "components" if m > 1 else "component"
-    require_shape("plant.input.G", u.G, (n, m), f"n = {n}, and u has {m} {parts}")
+    shapes.require_shape("plant.input.G", u.G, (n, m), f"n = {n}, and u has {m} {parts}")
 
 
 def _check_sensors(scenario: DerivedScenario) -> None:
@@ -165,13 +158,13 @@ def _check_sensors(scenario: DerivedScenario) -> None:
     for k, sensor in enumerate(scenario.sensors):
         key = scenario.sensor_key(k)
         if isinstance(sensor, RegressorSensor):
-            check_regressor(scenario, key, sensor)
+            shapes.check_regressor(scenario, key, sensor)
         elif not sensor.linear:
-            check_nonlinear(scenario, key, sensor)
+            shapes.check_nonlinear(scenario, key, sensor)
         else:
-            require_shape(f"{key}.H", sensor.H, (None, n), f"the state has {n} components")
+            shapes.require_shape(f"{key}.H", sensor.H, (None, n), f"the state has {n} components")
             p = len(sensor.H)
-            require_shape(f"{key}.R", sensor.R, (p, p), f"H has {p} rows")
+            shapes.require_shape(f"{key}.R", sensor.R, (p, p), f"H has {p} rows")
         for position, node in enumerate(sensor.nodes):
             if node not in index_of_node:
                 remedy = f"node ids here are {list_some(scenario.nodes, 8)}"
@@ -401,9 +394,9 @@ def _check_filter(scenario: DerivedScenario) -> None:
                 rule = "must be one for the filter that all nodes share"
                 raise ScenarioError(key, rule, f"{len(value)} entries", "give one")
             for k, item in enumerate(value):
-                require_shape(f"{key}[{k}]", item, shape, why)
+                shapes.require_shape(f"{key}[{k}]", item, shape, why)
         elif value is not None:
-            require_shape(key, value, shape, why)
+            shapes.require_shape(key, value, shape, why)
     model = filtering.model
     for name in "ABFQ":
         value = getattr(model, name)
@@ -416,7 +409,7 @@ def _check_filter(scenario: DerivedScenario) -> None:
             rule = explain_time_mismatch(scenario.slotted)
             remedy = "use F and Q for linear plants, A and B for diffusions"
             raise ScenarioError(f"filter.model.{name}", rule, value, remedy)
-        require_shape(f"filter.model.{name}", value, (n, None if name == "B" else n), why)
+        shapes.require_shape(f"filter.model.{name}", value, (n, None if name == "B" else n), why)
     if scenario.tells_models and algorithm.kernels is not None:
         rule = "must define shift beside its other methods, since the plant has an input and the "
         rule += "filter predicts by kernels, which do not know it"
@@ -424,7 +417,7 @@ def _check_filter(scenario: DerivedScenario) -> None:
         remedy += "filter.model.input = false"
         raise ScenarioError("filter.kind", rule, type(algorithm).__name__, remedy)
     _check_believed_noise(scenario)
-    check_weights(scenario)
+    shapes.check_weights(scenario)
     _check_degrees(scenario)
 
 
@@ -446,9 +439,9 @@ def _check_believed_noise(scenario: DerivedScenario) -> None:
         p = len(sensor.R)
         reason = f"a reading of sensors[{k}] has {p} components"
         if isinstance(R, tuple):
-            require_shape(f"filter.model.R[{k}]", R[k], (p, p), reason)
+            shapes.require_shape(f"filter.model.R[{k}]", R[k], (p, p), reason)
         else:
-            require_shape("filter.model.R", R, (p, p), reason)
+            shapes.require_shape("filter.model.R", R, (p, p), reason)
 
 
 def _check_degrees(scenario: DerivedScenario) -> None:
@@ -472,7 +465,7 @@ def _check_sensing_period(scenario: DerivedScenario) -> None:
     if period > scenario.diffusion.longest_period * (1.0 + 1e-9):
         remedy = f"give at most {scenario.diffusion.longest_period:.3g}, or leave it out"
         raise ScenarioError("plant.sensing_period", "is too long for the plant", period, remedy)
-    check_changes_on_grid(scenario, period)
+    shapes.check_changes_on_grid(scenario, period)
     distinct_models = {
         id(model): model for models in scenario.model_pieces for model in models if len(model.H)
     }.values()

@@ -47,18 +47,10 @@ from netkf.plants.sensors import Sensor
 from netkf.plants.states import PartlyDrawnTruth, RecordedPath, StackedStates
 from netkf.plants.transitions import frame_period, frame_slots
 from netkf.rng.streams import Streams
+from netkf.scenario import sampling
 from netkf.scenario.block_sensors import support_of
 from netkf.scenario.model import PlacedSensor, ScenarioModel
 from netkf.scenario.positions import tick_times
-from netkf.scenario.sampling import (
-    all_sample_times,
-    require_states,
-    sample_path,
-    sample_rate,
-    sample_times,
-    times_of_sensor,
-    uses_grid,
-)
 
 MAX_DECAY = float(np.log(1e8))
 """Largest decay of a mode, as a logarithm, over which an offset of states is predicted back."""
@@ -441,7 +433,7 @@ class DerivedScenario(ScenarioModel):
             raise TheoryError("this is about scenarios in continuous time, and this one has slots")
         plant = dataclasses.replace(plant, mean=plant.start_mean, cov=plant.start_cov)
         plant = plant.on_grid(self.time_grid)
-        if plant.sensing_period is not None or not uses_grid(self):
+        if plant.sensing_period is not None or not sampling.uses_grid(self):
             return plant
         # Nodes with the same sensors are counted and not listed, and G = H' R^-1 H of all nodes is
         # a sum: H and R of all nodes at once would grow with the square of the network.
@@ -476,11 +468,11 @@ class DerivedScenario(ScenarioModel):
         if isinstance(self.plant, NonlinearDiffusion):
             return self._nonlinear_truth(self.plant, streams, sampled)
         plant, horizon = self.diffusion, self.horizon
-        recorded, on_grid = not plant.is_random, uses_grid(self)
+        recorded, on_grid = not plant.is_random, sampling.uses_grid(self)
         if sampled is None or recorded:
-            by_sensor = sample_times(self, streams)
-            require_states(self, by_sensor, streams)
-            sampled = all_sample_times(by_sensor)
+            by_sensor = sampling.sample_times(self, streams)
+            sampling.require_states(self, by_sensor, streams)
+            sampled = sampling.all_sample_times(by_sensor)
         if self.links_follow_state:
             # Of a path that is drawn at some instants only, states do not depend on which.
             sampled = np.union1d(sampled, tick_times(self, streams))
@@ -508,9 +500,9 @@ class DerivedScenario(ScenarioModel):
         self, plant: NonlinearDiffusion, streams: Streams, sampled: FloatArray | None
     ) -> Any:
         if sampled is None:
-            sampled = all_sample_times(sample_times(self, streams))
+            sampled = sampling.all_sample_times(sampling.sample_times(self, streams))
         if not plant.is_random:
-            require_states(self, sample_times(self, streams), streams)
+            sampling.require_states(self, sampling.sample_times(self, streams), streams)
         if not plant.draws:
             return plant.recorded_truth
         random, *inside = map(streams.generator, ("plant", "samples", "probe"))
@@ -735,16 +727,16 @@ class DerivedScenario(ScenarioModel):
 
     def sample_times(self, streams: Streams) -> dict[tuple[int, int], FloatArray]:
         """Return sample times (K,) in seconds by sensor (node, ordinal) of a diffusion."""
-        return sample_times(self, streams)
+        return sampling.sample_times(self, streams)
 
     def sample_path(self, streams: Streams, node: int, placed_sensor: PlacedSensor) -> Samples:
         """Return the samples of one sensor of a node in one run in continuous time."""
-        path: Samples = sample_path(self, streams, node, placed_sensor)
+        path: Samples = sampling.sample_path(self, streams, node, placed_sensor)
         sensor = self.sensors[placed_sensor.entry]
         believed = self._moves_readings(sensor)
         if believed is None and sensor.fault is None:
             return path
-        times = times_of_sensor(self, streams, node, placed_sensor)
+        times = sampling.times_of_sensor(self, streams, node, placed_sensor)
         path = self.given_readings(path, streams, node, placed_sensor, times.tolist().__getitem__)
         return path if believed is None else MovedReadings(path, believed, times)
 
@@ -937,7 +929,7 @@ class DerivedScenario(ScenarioModel):
     def _send_rate(self, clock: LinkClock, direction: Link) -> float:
         sender, receiver = direction
         if clock.at == "readings":
-            return sample_rate(self, sender)
+            return sampling.sample_rate(self, sender)
         entities = {
             "links": (min(sender, receiver), max(sender, receiver)),
             "directions": direction,

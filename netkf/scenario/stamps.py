@@ -12,17 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.core.fields import (
-    MAX_SECONDS,
-    Component,
-    Rule,
-    SourceFile,
-    field,
-    integer,
-    one_of,
-    positive,
-    rebuild,
-)
+from netkf.core import fields
 from netkf.core.instants import COARSEST, FINEST, MAX_REFINE
 from netkf.core.stamps import UNITS, TimeBase
 from netkf.linalg.arrays import FloatArray
@@ -45,7 +35,7 @@ def _convert_origin(value: Any) -> int | float | str:
         value = float(value)
     elif not isinstance(value, str) or len(value) > 100:
         raise TypeError
-    if abs(_origin_seconds(value)) > MAX_SECONDS:
+    if abs(_origin_seconds(value)) > fields.MAX_SECONDS:
         raise ValueError
     result: int | float | str = value
     return result
@@ -55,7 +45,7 @@ def _origin_seconds(value: int | float | str) -> Decimal:
     return TimeBase().exact(value if isinstance(value, str) else repr(value))
 
 
-_origin = Rule(
+_origin = fields.Rule(
     "must be a number of seconds or an ISO 8601 time",
     _convert_origin,
     'write the stamp of simulated 0, such as 1248275404.5 or "2009-07-22T15:10:04.5Z"',
@@ -64,14 +54,14 @@ _origin = Rule(
 
 
 def _convert_resolution(value: Any) -> float:
-    seconds: float = positive.convert(value)
+    seconds: float = fields.positive.convert(value)
     exponent = round(math.log10(seconds))
     if seconds != float(f"1e{exponent}") or not FINEST <= exponent <= COARSEST:
         raise ValueError
     return seconds
 
 
-_resolution = Rule(
+_resolution = fields.Rule(
     "must be a power of ten of at most 1 second",
     _convert_resolution,
     "write 1e-6, say, or leave it out",
@@ -80,7 +70,7 @@ _resolution = Rule(
 
 
 @dataclass(frozen=True, eq=False)
-class Time(Component):
+class Time(fields.Component):
     """What the stamps of recorded tables mean, those in columns t, from and until.
 
     origin  the stamp of simulated 0: seconds, or an ISO 8601 time (UTC where it names no zone);
@@ -92,10 +82,10 @@ class Time(Component):
             numbers, such as 1/12, are whole numbers of ticks; by default as many as these need
     """
 
-    origin: int | float | str | None = field(_origin, default=None)
-    unit: str = field(one_of(*UNITS), default="s")
-    resolution: float | None = field(_resolution, default=None)
-    refine: int | None = field(integer(low=1, high=MAX_REFINE), default=None)
+    origin: int | float | str | None = fields.field(_origin, default=None)
+    unit: str = fields.field(fields.one_of(*UNITS), default="s")
+    resolution: float | None = fields.field(_resolution, default=None)
+    refine: int | None = fields.field(fields.integer(low=1, high=MAX_REFINE), default=None)
 
     @property
     def stamps(self) -> TimeBase:
@@ -109,11 +99,11 @@ def restamp(part: Any, stamps: TimeBase) -> Any:
     """Return a component whose tables are read with these ``stamps``; raises ScenarioError."""
 
     def change(_: Any, __: Any, value: Any) -> Any:
-        if isinstance(value, SourceFile):
+        if isinstance(value, fields.SourceFile):
             return value if value.stamps == stamps else dataclasses.replace(value, stamps=stamps)
-        return rebuild(value, change)
+        return fields.rebuild(value, change)
 
-    return rebuild(part, change)
+    return fields.rebuild(part, change)
 
 
 def stamp_notes(scenario: Any) -> tuple[str, ...]:

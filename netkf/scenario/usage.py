@@ -19,14 +19,8 @@ from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.network.scheduled import ScheduledLoss
 from netkf.plants.readings import ReadingTable
 from netkf.plants.sampling import RecordedSampling
+from netkf.scenario import records
 from netkf.scenario.derived import DerivedScenario
-from netkf.scenario.records import (
-    count_input_rows,
-    count_plant_rows,
-    count_state_rows,
-    exchange_slots,
-    sensed_slots,
-)
 
 Used = Callable[[Any], bool]
 Use = dict[str, Any]
@@ -71,7 +65,7 @@ def record_usage(scenario: DerivedScenario, sent: Mapping[Link, int] | None) -> 
             more = {"beyond": beyond, "after": component.after}
             uses[f"network.channel.{key}"] = _make_use(rows) | more
     uses |= {key: _make_use(use) for key, use in _find_sensor_uses(scenario).items()}
-    plant_uses = count_state_rows(scenario) | count_input_rows(scenario)
+    plant_uses = records.count_state_rows(scenario) | records.count_input_rows(scenario)
     return uses | {key: _make_use(use) for key, use in plant_uses.items()}
 
 
@@ -95,7 +89,7 @@ def usage_notes(usage: Mapping[str, Use]) -> tuple[str, ...]:
 def unused_notes(scenario: DerivedScenario, without_states: bool = False) -> tuple[str, ...]:
     """Return a line for each table with rows that no run uses, but losses and delays."""
     usage = record_usage(scenario, sent=None)
-    for key in count_state_rows(scenario) if without_states else ():
+    for key in records.count_state_rows(scenario) if without_states else ():
         del usage[key]
     return usage_notes(usage)
 
@@ -124,7 +118,7 @@ def repeat_notes(scenario: DerivedScenario) -> tuple[str, ...]:
         (f"network.graph{key}", "node" if key else "link", use)
         for key, use in scenario.topology.tables.items()
     ]
-    uses += [(key, "time", use) for key, use in count_plant_rows(scenario).items()]
+    uses += [(key, "time", use) for key, use in records.count_plant_rows(scenario).items()]
     uses += [(key, what, use) for key, (what, use) in _find_law_uses(scenario).items()]
     for key, (what, path, keys) in tables.items():
         uses.append((key, what, count_rows(path, keys, lambda _: True)))
@@ -162,7 +156,7 @@ def _activation_table(scenario: DerivedScenario) -> tuple[str, str, Sequence[Any
         what, rows = f"{activation.at.removesuffix('s')} and interval", activation.row_keys
         return what, activation.path.name, rows, lambda key: key[1] < end and key[2] > 0.0
     if isinstance(activation, RecordedSlots):
-        slots, path = exchange_slots(scenario) if talks else range(0), activation.path.name
+        slots, path = records.exchange_slots(scenario) if talks else range(0), activation.path.name
         return "slot and link", path, activation.row_keys, lambda key: key[0] in slots
     return None
 
@@ -214,7 +208,7 @@ def _find_row_use(
     # told apart by their row.
     is_reading = isinstance(component, ReadingTable)
     if scenario.slotted:
-        slots, period = sensed_slots(scenario), scenario.slot_plant.period
+        slots, period = records.sensed_slots(scenario), scenario.slot_plant.period
         return count_rows(
             component.path.name,
             [(node, t, row) for row, (node, t) in enumerate(rows)],

@@ -22,15 +22,7 @@ from netkf.core.notebook import NotebookTable
 from netkf.core.printable import list_some, shorten
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import name_rows
-from netkf.runs.documents import (
-    FINAL_STATUSES,
-    NUMBER,
-    DamagedError,
-    add_file_name,
-    check_files,
-    read_document,
-    require_form,
-)
+from netkf.runs import documents
 from netkf.runs.parquet_files import column_names, read_numbers
 from netkf.runs.quantities import quantities_in
 from netkf.runs.stored import MANIFEST_FORM, MESSAGES, SUMMARY_FORM, read_checked_document
@@ -144,7 +136,7 @@ class RunDirectory:
         if not file.exists() or self.runs < 2:
             return None
         with damage_named(self.directory):
-            check_files(self.directory, self.manifest, [file.name])
+            documents.check_files(self.directory, self.manifest, [file.name])
             names = column_names(file)
             if "sq_error" not in names:
                 return None
@@ -182,11 +174,11 @@ def read_directory(directory: Path) -> RunDirectory:
     if not directory.is_dir():
         raise ScenarioError(where, "is not a directory", None, "name run directories")
     with damage_named(directory):
-        with add_file_name("manifest.json"):
-            manifest = read_document(directory / "manifest.json")
-            require_form(manifest, MANIFEST_FORM)
+        with documents.add_file_name("manifest.json"):
+            manifest = documents.read_document(directory / "manifest.json")
+            documents.require_form(manifest, MANIFEST_FORM)
         # That of a sweep has no summary.
-        if manifest["status"] not in FINAL_STATUSES and "vary" not in manifest:
+        if manifest["status"] not in documents.FINAL_STATUSES and "vary" not in manifest:
             rule = f"holds a run that did not finish ({shorten(manifest['status'], 30)})"
             raise ScenarioError(where, rule, None, "finish it with netkf run --resume")
         read_checked_document(directory, "manifest.json", MANIFEST_FORM)  # its seal
@@ -194,12 +186,12 @@ def read_directory(directory: Path) -> RunDirectory:
         name_rows(summary["nodes"])
         for row in (*summary["nodes"], summary["overall"]):
             numbers = [key for name in quantities_in(row) for key in (name, f"{name}_se")]
-            require_form(row, {f"{key}?": NUMBER for key in numbers})
-        check_files(directory, manifest, ["scenario.toml", "summary.json"])
+            documents.require_form(row, {f"{key}?": documents.NUMBER for key in numbers})
+        documents.check_files(directory, manifest, ["scenario.toml", "summary.json"])
         try:
             tables = tomllib.loads((directory / "scenario.toml").read_text(encoding="utf-8"))
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise DamagedError(f"scenario.toml: {error}") from None
+            raise documents.DamagedError(f"scenario.toml: {error}") from None
     tables |= {key: manifest[key] for key in ("seed", "replica") if key in manifest}
     return RunDirectory(directory, manifest, summary, dict(_leaves(tables, "")))
 
@@ -226,7 +218,7 @@ def damage_named(directory: Path) -> Iterator[None]:
     """Turn a DamagedError into a ScenarioError that names the directory."""
     try:
         yield
-    except DamagedError as error:
+    except documents.DamagedError as error:
         rule = f"is not the directory of a run: {error}"
         raise ScenarioError(shorten(directory), rule, None, "name what netkf run left") from None
 

@@ -7,19 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from netkf.core.printable import shorten
+from netkf.figures import style
 from netkf.figures.catalogue import plot
 from netkf.figures.figure_data import UnavailableError
 from netkf.figures.stability import sweep_figure
-from netkf.figures.style import (
-    BLUE,
-    LOG_RATIO,
-    MUTED,
-    finish_figure,
-    label_text,
-    new_figure,
-    style_context,
-    write_figure,
-)
 from netkf.scenario.scenario import Scenario
 from netkf.studies.compare_filters import ComparedFilter, FilterComparison
 from netkf.studies.sweep import CompletedSweep
@@ -35,25 +26,27 @@ PANELS = (
 def sweep_picture(scenario: Scenario, completed: CompletedSweep) -> bool:
     """Write ``sweep.png`` and return True; False if more than two keys were varied."""
     try:
-        with style_context():
+        with style.style_context():
             figure = sweep_figure(scenario, completed.table, completed.keys, "complete")
     except UnavailableError:
         return False
-    write_figure(figure, completed.directory / "sweep.png")
+    style.write_figure(figure, completed.directory / "sweep.png")
     return True
 
 
 def filter_picture(scenario: Scenario, comparison: FilterComparison, directory: Path) -> None:
     """Write ``filters.png`` (errors, consistency, traffic) and ``errors.png`` (over time)."""
     rows = [row for row in comparison.rows if row.ran]
-    with style_context():
-        figure = new_figure(9.6, 1.7 + 0.34 * len(rows))
+    with style.style_context():
+        figure = style.new_figure(9.6, 1.7 + 0.34 * len(rows))
         panels = figure.subplots(1, len(PANELS) + 1, sharey=True)
         for axes, (name, label) in zip(panels, PANELS, strict=False):
             unit = scenario.common_unit if name != "nees_ratio" else ""
-            _draw_quantity(axes, rows, name, label + (f", {label_text(unit)}" if unit else ""))
+            _draw_quantity(
+                axes, rows, name, label + (f", {style.label_text(unit)}" if unit else "")
+            )
         kilobytes = [row.bytes / 1000.0 for row in rows]
-        panels[-1].barh(range(len(rows)), kilobytes, height=0.5, color=MUTED)
+        panels[-1].barh(range(len(rows)), kilobytes, height=0.5, color=style.MUTED)
         panels[-1].set_xlabel("kB sent in a run")
         labels = [shorten(row.filter, MAX_LABEL) for row in rows]
         panels[0].set_yticks(range(len(rows)), labels, parse_math=False)
@@ -65,10 +58,10 @@ def filter_picture(scenario: Scenario, comparison: FilterComparison, directory: 
             best = min(finite, key=lambda row: row.rms_error.value)
             error = f"{best.rms_error.value:.3g}"
             title = f"{shorten(best.filter, MAX_LABEL)} has the smallest RMS error, {error}"
-        finish_figure(figure, title, [f"{scenario.name}: {runs}"])
-    write_figure(figure, directory / "filters.png")
+        style.finish_figure(figure, title, [f"{scenario.name}: {runs}"])
+    style.write_figure(figure, directory / "filters.png")
     if comparison.curves:
-        write_figure(plot(comparison), directory / "errors.png")
+        style.write_figure(plot(comparison), directory / "errors.png")
 
 
 def _draw_quantity(axes: Any, rows: list[ComparedFilter], name: str, label: str) -> None:
@@ -76,13 +69,13 @@ def _draw_quantity(axes: Any, rows: list[ComparedFilter], name: str, label: str)
     bars = [2.0 * row.quantities[name].se for row in rows]
     bars = [bar if math.isfinite(bar) else 0.0 for bar in bars]
     axes.errorbar(
-        values, range(len(rows)), xerr=bars, ls="", marker="o", ms=4, capsize=2, color=BLUE
+        values, range(len(rows)), xerr=bars, ls="", marker="o", ms=4, capsize=2, color=style.BLUE
     )
     axes.set_xlabel(label)
     positive = [value for value in values if math.isfinite(value) and value > 0.0]
-    if positive and max(positive) > LOG_RATIO * min(positive):
+    if positive and max(positive) > style.LOG_RATIO * min(positive):
         axes.set_xscale("log")
     elif name != "nees_ratio":
         axes.set_xlim(left=0.0)
     if name == "nees_ratio":
-        axes.axvline(1.0, color=MUTED, lw=0.8, ls="--")
+        axes.axvline(1.0, color=style.MUTED, lw=0.8, ls="--")

@@ -14,13 +14,7 @@ from netkf.ensembles.blocks import BlockTask, each_replica
 from netkf.ensembles.pools import PoolOptions, make_pool
 from netkf.runs.simulate import choose_engine, require_scenario
 from netkf.scenario.scenario import Scenario
-from netkf.studies.metrics import (
-    block_metrics,
-    expected_errors_known,
-    expected_metrics,
-    is_small,
-    join_batches,
-)
+from netkf.studies import metrics
 from netkf.studies.parameter_grid import is_integer_key
 from netkf.studies.search import (
     CHEAP_RUNS,
@@ -84,7 +78,7 @@ def size(
     base = parsed.prepare(scenario if seed is None else scenario.replace({"seed": seed}))
     is_integer = _check_range(base, key, low, high)
     engine_used = choose_engine(engine, base.replace({key: low}))
-    cheap = engine_used.name == "compiled" and is_small(base) and (given or RUNS) >= RUNS
+    cheap = engine_used.name == "compiled" and metrics.is_small(base) and (given or RUNS) >= RUNS
     most = given or (CHEAP_RUNS if cheap else RUNS)
     chosen = by or _choose_method(base, key, (low, high), parsed)
     search = Search(base, key, is_integer, parsed, chosen)
@@ -94,12 +88,12 @@ def size(
         except TheoryError as error:
             raise TheoryError(f"{error}; --by simulation sizes any filter and network") from None
     quantity = f"{parsed.description}, over the runs"
-    task: BlockTask = partial(block_metrics, engine=engine_used)
+    task: BlockTask = partial(metrics.block_metrics, engine=engine_used)
     first = FIRST_BATCH
     # Expected squared errors vary less from run to run than squared errors: fewer runs suffice.
-    if parsed.of_errors and not cheap and expected_errors_known(search.at(low)):
-        expected = partial(expected_metrics, engine=engine_used)
-        task, first = partial(each_replica, expected, join_batches), FIRST_EXPECTED
+    if parsed.of_errors and not cheap and metrics.expected_errors_known(search.at(low)):
+        expected = partial(metrics.expected_metrics, engine=engine_used)
+        task, first = partial(each_replica, expected, metrics.join_batches), FIRST_EXPECTED
         quantity += ", each with its exact expected squared error given its events"
     if chosen == "both":
         bound = quantity_by_theory(search.at(low), parsed)[1]
