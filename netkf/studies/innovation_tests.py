@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.special import chndtrinc, gammainc, gammaincc, gammaincinv, ndtr, ndtri, stdtrit
 
-from netkf.algorithms.baselines import Central, Local
-from netkf.algorithms.intermittent import Intermittent
+from netkf.algorithms.baselines import Central
 from netkf.algorithms.registry import overridden
 from netkf.checks.innovations import MIN_READINGS, Innovations, autocorrelation, compute_innovations
 from netkf.core.errors import ScenarioError
@@ -216,7 +215,8 @@ def law_of(scenario: Scenario) -> Law:
     ):
         if holds:
             return Law("", reason)
-    if isinstance(algorithm, (Local, Intermittent)):
+    # Nodes that tell each other readings only, or nothing, are Kalman filters of what they know.
+    if not (algorithm.timing.talks and any(map(algorithm.analysis.tells_estimates, (-1, 0)))):
         return Law("white")
     if algorithm.analysis.swaps:
         return Law("exact")

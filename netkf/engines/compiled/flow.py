@@ -226,11 +226,7 @@ class Workspace:
                 start.table, start.gains, self._unrolled, self._scenario.plant.n
             )
         scratch, flow_arrays = self._scratch
-        nodes = start.nodes.copy()
-        nodes["down"] = draws.lives.filters_down
-        for place, clock in draws.clocks.items():
-            nodes["offset"][place], nodes["pace"][place] = clock.offset, clock.pace
-        n = start.xhat.shape[1]
+        nodes, n = self._begin_nodes(draws), start.xhat.shape[1]
         xhat, root = self._begin_estimates(instants, together)
         state: Simulation = (Simulation.of_size(n) if self._unrolled else Simulation)(
             size=sized(n) if self._unrolled else np.zeros(n),
@@ -270,6 +266,14 @@ class Workspace:
             **dict.fromkeys(AT_START, 0),
         )
         return state
+
+    def _begin_nodes(self, draws: Any) -> Any:
+        """Return the records of nodes, with who is down and what clocks show in a run."""
+        nodes = self._start.nodes.copy()
+        nodes["down"] = draws.lives.filters_down
+        for place, clock in draws.clocks.items():
+            nodes["offset"][place], nodes["pace"][place] = clock.offset, clock.pace
+        return nodes
 
     def _begin_reading(self, lives: LifeTable) -> IntArray:
         """Let nodes that are down at first read no increments; return ``Simulation.waking``."""
