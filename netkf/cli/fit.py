@@ -72,9 +72,14 @@ def _run(options: argparse.Namespace) -> int:
     if options.set:
         raise ScenarioError("--set", "is for --noise", options.set[0], "leave it out")
     with ProgressLine() as line:
-        settings = {name: getattr(options, name) for name in ("confidence", "trust", "workers")}
-        settings["progress"] = line.make_count_update("runs")
-        found = fit_log(options.directory, 0 if options.no_runs else options.runs, **settings)
+        found = fit_log(
+            options.directory,
+            0 if options.no_runs else options.runs,
+            confidence=options.confidence,
+            trust=options.trust,
+            workers=options.workers,
+            progress=line.make_count_update("runs"),
+        )
     if options.json:
         names = ("links", "tests", "laws", "envelope")
         tables = {name: getattr(found, name).to_dict("records") for name in names}

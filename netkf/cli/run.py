@@ -85,9 +85,15 @@ def _run_ensemble(scenario: Scenario, options: argparse.Namespace) -> int:
         load = partial(pictures.load_drawing, pictures.ENSEMBLE)
         threading.Thread(target=load, daemon=True).start()
     with ProgressLine() as line:
-        asked = scenario, options.runs, options.out, settings
-        progress = line.make_count_update("runs")
-        completed = runs_to_directory(*asked, progress=progress, finish=draw, note=_print_note)
+        completed = runs_to_directory(
+            scenario,
+            options.runs,
+            options.out,
+            settings,
+            progress=line.make_count_update("runs"),
+            finish=draw,
+            note=_print_note,
+        )
     if completed is None:
         print(f"nothing left to do in {options.out}")
         return 0

@@ -88,9 +88,16 @@ def run_import(options: argparse.Namespace) -> int:
     """``netkf import``: write a log as a scenario with its tables."""
     from netkf.logs.importing import import_log
 
-    names = ("like", "unreported", "hole", "trust", "columns")
-    settings = {name: getattr(options, name) for name in names}
-    files, notes = import_log(options.log, options.kind, options.out, **settings)
+    files, notes = import_log(
+        options.log,
+        options.kind,
+        options.out,
+        like=options.like,
+        unreported=options.unreported,
+        hole=options.hole,
+        trust=options.trust,
+        columns=options.columns,
+    )
     print(f"written: {files[0]} with {', '.join(path.name for path in files[1:])}")
     for note in notes:
         print(note if ": " in note[:14] else f"note: {note}")

@@ -89,9 +89,18 @@ def run_size(options: argparse.Namespace) -> int:
     key, low, high = parse_interval(options.vary[0])
     scenario = load_scenario(options)
     with ProgressLine() as line:
-        how = options.target, options.by, options.runs, options.confidence
-        settings = {**pool_settings(options), "progress": line.replace}
-        sizing = size(scenario, key, low, high, *how, **settings)
+        sizing = size(
+            scenario,
+            key,
+            low,
+            high,
+            options.target,
+            options.by,
+            options.runs,
+            options.confidence,
+            **pool_settings(options),
+            progress=line.replace,
+        )
     print_table_notes(scenario)
     if options.json:
         probes = [probe._asdict() for probe in sorted(sizing.probes)]
@@ -123,9 +132,14 @@ def _compare_filters(options: argparse.Namespace) -> int:
     filters = parse_values("--filters", "filters", options.filters)
     scenario = load_scenario(options)
     with ProgressLine() as line:
-        settings = {**pool_settings(options), "progress": line.make_count_update("filters")}
-        settings["confidence"] = options.confidence
-        comparison = compare_filters(scenario, filters, options.runs, **settings)
+        comparison = compare_filters(
+            scenario,
+            filters,
+            options.runs,
+            confidence=options.confidence,
+            **pool_settings(options),
+            progress=line.make_count_update("filters"),
+        )
     print_table_notes(scenario)
     print_notes([f"{row.filter}: {row.status}" for row in comparison.rows if not row.ran])
     try:

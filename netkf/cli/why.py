@@ -33,8 +33,16 @@ def _explain(options: argparse.Namespace) -> int:
     if node is None:
         run, node, at, note = _find_worst_sample(options)
         notes.append(note)
-    names = ("replica", "below", "most", "replays", "trust")
-    explanation = why(run, node, at, **{name: getattr(options, name) for name in names})
+    explanation = why(
+        run,
+        node,
+        at,
+        replica=options.replica,
+        below=options.below,
+        most=options.most,
+        replays=options.replays,
+        trust=options.trust,
+    )
     # Not before: a refusal is one line.
     print_notes(notes)
     try:

@@ -192,10 +192,18 @@ def _draw_nodes(
         if not nodes:
             continue
         xy = np.array([positions[n] for n in nodes])
-        cmap = mpl.colormaps[SEQUENTIAL].with_extremes(bad="white")
-        style: dict[str, Any] = {"edgecolors": INK, "linewidths": 0.5, "zorder": 2, "norm": scale}
-        # An equal aspect may leave a marker at the rim no room.
-        style |= {"clip_on": False, "plotnonfinite": True, "s": _dot_area(data), "label": label}
-        colours = [values.get(n, math.nan) for n in nodes]
-        dots = axes.scatter(*xy.T, c=colours, marker=marker, cmap=cmap, **style)
+        dots = axes.scatter(
+            *xy.T,
+            c=[values.get(n, math.nan) for n in nodes],
+            marker=marker,
+            cmap=mpl.colormaps[SEQUENTIAL].with_extremes(bad="white"),
+            norm=scale,
+            s=_dot_area(data),
+            edgecolors=INK,
+            linewidths=0.5,
+            zorder=2,
+            label=label,
+            plotnonfinite=True,
+            clip_on=False,  # an equal aspect may leave a marker at the rim no room
+        )
     return dots if finite else None

@@ -175,10 +175,16 @@ def draw_legend(axes: Any, columns: int | None = None) -> None:
     handles, labels = axes.get_legend_handles_labels()
     if not labels:
         return
-    # A legend may be a little wider than its axes: margins and tick labels are beside them.
-    columns = columns or _legend_columns(labels, 1.08 * _axes_width(axes))
-    place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0)}
-    axes.legend(handles, labels, **place, ncols=columns, columnspacing=1.4, borderaxespad=0.2)
+    axes.legend(
+        handles,
+        labels,
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        # A legend may be a little wider than its axes: margins and tick labels are beside them.
+        ncols=columns or _legend_columns(labels, 1.08 * _axes_width(axes)),
+        columnspacing=1.4,
+        borderaxespad=0.2,
+    )
 
 
 def _axes_width(axes: Any) -> float:

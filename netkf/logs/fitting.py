@@ -430,10 +430,16 @@ def _fit_laws(
 ) -> list[FittedLaw]:
     count, heard = outcomes.counts.T.astype(float)
     total = np.array([count.sum(), heard.sum()])
-    each, logged = np.stack([count, heard], 1) / shrink, total[None] / shrink
     laws = [
-        FittedLaw("bernoulli", total[1:] / total[0], _likelihood(*total[::-1]), logged),
-        FittedLaw("per-link", heard / count, _likelihood(heard, count), each),
+        FittedLaw(
+            "bernoulli", total[1:] / total[0], _likelihood(total[1], total[0]), total[None] / shrink
+        ),
+        FittedLaw(
+            "per-link",
+            heard / count,
+            _likelihood(heard, count),
+            np.stack([count, heard], 1) / shrink,
+        ),
     ]
     if bursty:
         chain = stats.fit_chain(outcomes)

@@ -194,8 +194,13 @@ def _assemble_page(
         if entry.layout is not None
     ]
     runs = [first for first, *_ in choices]
-    named = [(f"{run['words']}: " if run["words"] else "", run) for data in choices for run in data]
-    rules = list(dict.fromkeys(name + rule for name, run in named for rule in thinning_rules(run)))
+    rules = [
+        f"{run['words']}{': ' * bool(run['words'])}{rule}"
+        for data in choices
+        for run in data
+        for rule in thinning_rules(run)
+    ]
+    rules = list(dict.fromkeys(rules))
     packed, sizes = packer.text()
     sources = [entry.source for entry in entries]
     data = {

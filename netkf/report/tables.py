@@ -79,10 +79,16 @@ def summary_section(source: ReportSource) -> str:
     runs = f"averages over {source.runs:,} runs, +- one standard error" if source.runs > 1 else ""
     caption = f"Averages over time{'; ' + runs if runs else ''}: {source.label}"
     messages = summary["messages"]
-    words = {"sent": "sent", "delivered": "delivered", "lost": "lost or late"}
-    words["in_flight"] = "on their way at the end"
-    known = [(messages.get(name), word) for name, word in words.items()]
-    counts = ", ".join(f"{format_count(n)} {word}" for n, word in known if n is not None)
+    counts = ", ".join(
+        f"{format_count(messages[name])} {label}"
+        for name, label in (
+            ("sent", "sent"),
+            ("delivered", "delivered"),
+            ("lost", "lost or late"),
+            ("in_flight", "on their way at the end"),
+        )
+        if messages.get(name) is not None
+    )
     states = [source.scenario.states_note] if source.scenario.states_note else []
     notes = [*states, f"messages: {counts}", *_bound_notes(source), *summary.get("notes", [])]
     return table_box(caption, ["node", *columns.values()], listed) + bullets(notes)

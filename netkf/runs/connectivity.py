@@ -184,9 +184,12 @@ class ConnectivitySink(Sink):
         }
         if self.by_messages:
             return entry
-        back = shares if topology.directed else {(j, i): up for (i, j), up in shares.items()}
         entry["links"] = [
-            {**node_columns(i), "peer": j, "up": min(shares[i, j], back[i, j])}
+            {
+                **node_columns(i),
+                "peer": j,
+                "up": shares[i, j] if topology.directed else min(shares[i, j], shares[j, i]),
+            }
             for i, j in topology.links
         ]
         return entry

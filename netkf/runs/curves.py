@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
+from netkf.trace.batch import RunBatch
 
 
 class ErrorCurve(NamedTuple):
@@ -31,3 +32,11 @@ class ErrorCurve(NamedTuple):
     central: float = np.nan
     bound: FloatArray | None = None
     unit: str = "units of the state"
+
+
+def squares_over_time(batch: RunBatch, rows: np.ndarray) -> FloatArray:
+    """Return squared errors (R, K) at samples ``rows``, mean of nodes, nan after divergence."""
+    error = batch.error[:, rows]  # nan in components that a node does not estimate
+    found = np.nansum(error * error, axis=3).mean(axis=2)
+    ends = batch.lengths - batch.diverged
+    return np.asarray(np.where(rows[None, :] < ends[:, None], found, np.nan))

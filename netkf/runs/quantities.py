@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -172,10 +171,16 @@ def _make_ages(scenario: Scenario) -> Ages | None:
     asked = scenario.metrics.network or len(scenario.nodes) * len(sources) <= MAX_PAIRS
     if not asked or not has_ages(scenario):
         return None
-    analysis, links = scenario.node_filter.analysis, scenario.topology.directions
-    read = sorted(sources), links, sorted(scenario.increment_sensors), scenario.forgetful_nodes
-    told = analysis.swaps, analysis.tells_estimates, partial(_read_at, scenario)
-    return Ages(scenario.nodes, *read, *told)
+    return Ages(
+        scenario.nodes,
+        sorted(sources),
+        scenario.topology.directions,
+        sorted(scenario.increment_sensors),
+        scenario.forgetful_nodes,
+        scenario.node_filter.analysis.swaps,
+        scenario.node_filter.analysis.tells_estimates,
+        lambda nodes, times: _read_at(scenario, nodes, times),
+    )
 
 
 def _read_at(scenario: Scenario, nodes: np.ndarray, times: FloatArray) -> FloatArray:

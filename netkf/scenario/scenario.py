@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -85,9 +84,17 @@ class Scenario(DerivedScenario):
         make = self.node_filter.needs.notes
         with explained(self, _class_error):
             notes = () if make is None else tuple(make(self))
-        makers = repeat_notes, record_notes, sampling_notes, unheard_notes, stamp_notes, grid_notes
-        found = itertools.chain.from_iterable(make(self) for make in makers)
-        return (*self.topology.notes, *notes, *found, *self._unused_notes)
+        return (
+            *self.topology.notes,
+            *notes,
+            *repeat_notes(self),
+            *record_notes(self),
+            *sampling_notes(self),
+            *unheard_notes(self),
+            *stamp_notes(self),
+            *grid_notes(self),
+            *self._unused_notes,
+        )
 
     @property
     def _unused_notes(self) -> tuple[str, ...]:

@@ -137,10 +137,14 @@ class Why:
 
         # Ages are also known for 1, 2, ... ``budget`` more messages delivered.
         budget = len(self.sources[0].with_more) if self.sources else 0
-        names = ("node", "sensor", "neighbour", "heard", "arrived", "unheard")
         rows = [
             {
-                **{name: getattr(s, name) for name in names},
+                "node": s.node,
+                "sensor": s.sensor,
+                "neighbour": s.neighbour,
+                "heard": s.heard,
+                "arrived": s.arrived,
+                "unheard": s.unheard,
                 "known_age": self._age_at_sample(s.known),
                 "reading": s.reading,
                 "reading_age": self._age_at_sample(s.reading),

@@ -14,7 +14,7 @@ from netkf.ensembles.replicas import form_of
 from netkf.ensembles.statistics import run_values
 from netkf.laws.intervals import interval_of_squares
 from netkf.linalg.arrays import FloatArray
-from netkf.runs.curves import ErrorCurve
+from netkf.runs.curves import ErrorCurve, squares_over_time
 from netkf.runs.quantities import NETWORK, NetworkSink, with_network
 from netkf.runs.simulate import simulate
 from netkf.runs.summary import promise_traces
@@ -75,10 +75,7 @@ def block_values(
         values = run_values(batch, scenario)
         # (R,): squared error and NEES, means over time and nodes.
         square, _, nees = values.averages[:, -1].T
-        error = batch.error[:, rows]  # nan in components that a node does not estimate
-        squares = np.nansum(error * error, axis=3).mean(axis=2)
-        ends = batch.lengths - batch.diverged
-        curves = np.where(rows[None, :] < ends[:, None], squares, np.nan)
+        curves = squares_over_time(batch, rows)
         quantities = values.quantities[:, -1]
         parts.append(FilterValues(square, nees, quantities, values.diverged > 0, curves))
     return join_batches(*parts)

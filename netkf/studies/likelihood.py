@@ -493,9 +493,17 @@ def _make_fit(
         scenario.replace(changes)
     except ScenarioError as error:
         notes.append(f"the scenario cannot run with the values: {error}")
-    best, start = model.value(factors), model.value(np.ones(len(factors)))
-    found = scenario.name, table, best, start, len(model.y), confidence
-    return NoiseFit(*found, changes, scenario, tuple(notes))
+    return NoiseFit(
+        scenario.name,
+        table,
+        model.value(factors),
+        model.value(np.ones(len(factors))),
+        len(model.y),
+        confidence,
+        changes,
+        scenario,
+        tuple(notes),
+    )
 
 
 def _changes(

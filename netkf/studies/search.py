@@ -178,11 +178,20 @@ class Search:
         described = "" if at is None else describe_help(self.at(at), self.target, self.key)
         central = described and f"at {self.key} = {at:g} {described}"
         hopeless = value is None and central.endswith(BEYOND) and not self.key.startswith("sensors")
-        sure = self._describe_certainty(confidence, grows, value is None)
-        advice = "" if hopeless else self._advise(value, misses, grows)
-        asked, probes = (self.key, self.target, self.by), tuple(self.probes)
-        found = *asked, value, misses, grows, confidence, probes, quantity
-        return Sizing(*found, sure, advice, central)
+        return Sizing(
+            self.key,
+            self.target,
+            self.by,
+            value,
+            misses,
+            grows,
+            confidence,
+            tuple(self.probes),
+            quantity,
+            sure=self._describe_certainty(confidence, grows, value is None),
+            advice="" if hopeless else self._advise(value, misses, grows),
+            central=central,
+        )
 
     def _bisect(self, value: float, misses: float) -> tuple[float, float]:
         while len(self.probes) < MAX_PROBES[self.by]:
