@@ -262,27 +262,37 @@ def test_linear_plants_are_those_whose_f_is_linear(
     np.testing.assert_allclose(run.xhat, other.xhat, atol=1e-5)
 
 
-def test_increments_are_taken_for_those_of_the_time_that_passed_by_the_clock(scenario_of):
-    """dy = H x dt without noise: by a clock that shows s = offset + pace t it is H x / pace ds."""
+@pytest.mark.parametrize("size", [0.0, 1.0])
+def test_increments_are_taken_for_those_of_the_time_that_passed_by_the_clock(scenario_of, size):
+    """dy = H x dt without noise: by a clock that shows s = offset + pace t it is H x / pace ds. A
+    known input is expected by the clock.
+    """
     scenario = scenario_of(filter_="local", horizon=4.0).replace(
         {"sensors": [{"nodes": [0, 1, 2], "H": H.tolist(), "R": [[1e-22]]}]}
     )
+    sine = {"kind": "sine", "amplitude": [size], "frequency": [0.7], "phase": [0.0]}
+    if size:
+        scenario = scenario.replace({"plant.input": sine | {"G": G[:, None].tolist()}})
+
+    def drive(t):
+        return G * size * np.sin(2.0 * np.pi * 0.7 * t) if t > 0.0 else 0.0 * G
+
     with pytest.raises(netkf.EngineError, match="increments at nodes whose clocks are wrong"):
         netkf.simulate(scenario, engine="compiled")
     run = netkf.simulate(scenario)
     for node, drift in enumerate(DRIFT):
-        pace = 1.0 + drift
+        pace, offset = 1.0 + drift, OFFSET[node]
 
-        def slope(t, y, pace=pace):
+        def slope(t, y, pace=pace, offset=offset):
             x, xhat, P = y[:2], y[2:4], y[4:].reshape(2, 2)
             gain = P @ H.T @ np.linalg.inv(R)
             dP = A @ P + P @ A.T + BB - gain @ R @ gain.T
-            dxhat = pace * A @ xhat + gain @ H @ (x - pace * xhat)
-            return np.concatenate([A @ x, dxhat, pace * dP.ravel()])
+            dxhat = pace * (A @ xhat + drive(offset + pace * t)) + gain @ H @ (x - pace * xhat)
+            return np.concatenate([A @ x + drive(t), dxhat, pace * dP.ravel()])
 
         start = [2.0, -3.0, 0.5, 0.0, 1.0, 0.2, 0.2, 2.0]
         y = scipy.integrate.solve_ivp(
-            slope, (0.0, 4.0), start, "DOP853", run.times, rtol=1e-11, atol=1e-12
+            slope, (0.0, 4.0), start, "DOP853", run.times, rtol=1e-11, atol=1e-12, max_step=0.1
         ).y.T
         np.testing.assert_allclose(run.x, y[:, :2], atol=1e-8)
         np.testing.assert_allclose(run.P[:, node], y[:, 4:].reshape(-1, 2, 2), atol=1e-8)
@@ -509,7 +519,7 @@ def test_drawn_clocks_differ_by_node_and_run_and_have_their_law(scenario_of):
         ({"filter": {"kind": "central"}}, "network.clocks"),
         (
             {
-                "plant.input": {"kind": "constant", "G": [[1.0], [0.0]], "value": [1.0]},
+                "plant.schedule": [{"from": 2.0, "A": [[0.1, 0.0], [0.0, 0.1]]}],
                 "sensors": [{"nodes": [0, 1], "H": [[1.0, 0.0]], "R": [[1.0]]}],
             },
             "clocks",

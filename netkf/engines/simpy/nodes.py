@@ -35,7 +35,7 @@ from netkf.network.node_clocks import NodeTime
 from netkf.plants.driven import moved_reading
 from netkf.plants.nonlinear import linearise_by_points
 from netkf.plants.readings import Stacked
-from netkf.plants.response import Response
+from netkf.plants.response import FlowResponse
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES
 
@@ -394,7 +394,7 @@ class ClockedNode(Node):
         truth: Any,
         increments: list[Any],
         clock: NodeTime,
-        response: Response | None,
+        response: FlowResponse | None,
         *arguments: Any,
     ) -> None:
         """``response`` is that to the input which estimates are counted from: at the time of the
@@ -473,18 +473,26 @@ class ClockedNode(Node):
             # Predict first: the increments of a gap are an observation at its end.
             gap = end - self._now
             self._predict(self._now, gap)
-            moments = self._read(true_time if end == time else self._clock.time_of(end))
+            moments = self._read(true_time if end == time else self._clock.time_of(end), end)
             # The two moments of the increments, with the gains for a gap of this length.
             if self.moving_model.reads:
                 self.state = self.algorithm.update(self.state, Increments(moments, gap))
             self._now = end
 
-    def _read(self, end: float) -> FloatArray:
+    def _read(self, end: float, shown: float) -> FloatArray:
         """Return the moments (2 p,) of the increments of all sensors since those before, up to
-        ``end`` (s); time by a clock is a multiple of time, which does not change them.
+        ``end``, when the clock shows ``shown`` (both in s); time by a clock is a multiple of time,
+        which does not change them.
         """
         truth, start, self._read_to = self._truth, self._read_to, end
         x_moments = truth.moments(start, end)
+        if self._response is not None:
+            # Counted from the response over the time that passed by the clock.
+            true, known = (
+                self._response.over_pieces(np.array([a]), np.array([b]), self._clock.grid)[1][0, 1:]
+                for a, b in ((start, end), (self._now, shown))
+            )
+            x_moments = x_moments + true - known
         parts = [sensor.moments(truth, x_moments, start, end) for sensor in self._increments]
         # Stack the sensors: first moments of all rows, then the second ones.
         stacked = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
