@@ -275,8 +275,10 @@ def _check_clocks(scenario: DerivedScenario) -> None:
     elif recorded:
         why, nodes = "cannot be of nodes whose readings are recorded, with their stamps", recorded
         remedy = "leave these out, and write into their tables the stamps that filters believe"
-    elif scenario.has_mistimed_increments and len(scenario.followed_changes):
-        why = "cannot be of nodes whose sensors give increments, of a plant with known changes"
+    elif (
+        scenario.has_mistimed_increments and len(scenario.followed_changes) and scenario.knows_input
+    ):
+        why = "cannot be of nodes whose sensors give increments, of a plant with input and changes"
     elif scenario.has_mistimed_models and scenario.node_filter.needs.blocks and scenario.plants:
         why = f"cannot stand beside inputs or changes that the {filter_name(scenario)} knows"
     if clocks and why is not None:

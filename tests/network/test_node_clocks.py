@@ -262,10 +262,12 @@ def test_linear_plants_are_those_whose_f_is_linear(
     np.testing.assert_allclose(run.xhat, other.xhat, atol=1e-5)
 
 
-@pytest.mark.parametrize("size", [0.0, 1.0])
-def test_increments_are_taken_for_those_of_the_time_that_passed_by_the_clock(scenario_of, size):
+@pytest.mark.parametrize(("size", "change"), [(0.0, 9.0), (1.0, 9.0), (0.0, 2.0)])
+def test_increments_are_taken_for_those_of_the_time_that_passed_by_the_clock(
+    scenario_of, size, change
+):
     """dy = H x dt without noise: by a clock that shows s = offset + pace t it is H x / pace ds. A
-    known input is expected by the clock.
+    known input, and a change of the plant, are expected by the clock.
     """
     scenario = scenario_of(filter_="local", horizon=4.0).replace(
         {"sensors": [{"nodes": [0, 1, 2], "H": H.tolist(), "R": [[1e-22]]}]}
@@ -273,6 +275,12 @@ def test_increments_are_taken_for_those_of_the_time_that_passed_by_the_clock(sce
     sine = {"kind": "sine", "amplitude": [size], "frequency": [0.7], "phase": [0.0]}
     if size:
         scenario = scenario.replace({"plant.input": sine | {"G": G[:, None].tolist()}})
+
+    if change < 9.0:
+        scenario = scenario.replace({"plant.schedule": [{"from": change, "A": LATER_A.tolist()}]})
+
+    def law(t):
+        return LATER_A if t >= change else A
 
     def drive(t):
         return G * size * np.sin(2.0 * np.pi * 0.7 * t) if t > 0.0 else 0.0 * G
@@ -285,10 +293,11 @@ def test_increments_are_taken_for_those_of_the_time_that_passed_by_the_clock(sce
 
         def slope(t, y, pace=pace, offset=offset):
             x, xhat, P = y[:2], y[2:4], y[4:].reshape(2, 2)
-            gain = P @ H.T @ np.linalg.inv(R)
-            dP = A @ P + P @ A.T + BB - gain @ R @ gain.T
-            dxhat = pace * (A @ xhat + drive(offset + pace * t)) + gain @ H @ (x - pace * xhat)
-            return np.concatenate([A @ x + drive(t), dxhat, pace * dP.ravel()])
+            shown = offset + pace * t
+            gain, M = P @ H.T @ np.linalg.inv(R), law(shown)
+            dP = M @ P + P @ M.T + BB - gain @ R @ gain.T
+            dxhat = pace * (M @ xhat + drive(shown)) + gain @ H @ (x - pace * xhat)
+            return np.concatenate([law(t) @ x + drive(t), dxhat, pace * dP.ravel()])
 
         start = [2.0, -3.0, 0.5, 0.0, 1.0, 0.2, 0.2, 2.0]
         y = scipy.integrate.solve_ivp(
@@ -519,6 +528,7 @@ def test_drawn_clocks_differ_by_node_and_run_and_have_their_law(scenario_of):
         ({"filter": {"kind": "central"}}, "network.clocks"),
         (
             {
+                "plant.input": {"kind": "constant", "G": [[1.0], [0.0]], "value": [1.0]},
                 "plant.schedule": [{"from": 2.0, "A": [[0.1, 0.0], [0.0, 0.1]]}],
                 "sensors": [{"nodes": [0, 1], "H": [[1.0, 0.0]], "R": [[1.0]]}],
             },
