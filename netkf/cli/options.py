@@ -7,11 +7,11 @@ for numpy and numba.
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -58,7 +58,7 @@ def parse_changes(settings: Sequence[str]) -> dict[str, Any]:
 
     pairs = [split_setting("--set", setting) for setting in settings]
     # What counts is the last value of a key, and a table replaces what its keys had before.
-    both = itertools.combinations([key for key, _ in pairs], 2)
+    both = combinations([key for key, _ in pairs], 2)
     lost = {early: late for early, late in both if replaces_key(late, early)}
     print_notes([f"--set {late} replaces {early}, set before it" for early, late in lost.items()])
     return {key: parse_value("--set", key, text) for key, text in pairs}

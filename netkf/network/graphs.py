@@ -9,6 +9,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -546,7 +547,7 @@ class RangeGraph(Graph):
         ids = assign_ids(labels)
         _check_size(len(ids), len(ids) * (len(ids) - 1) // 2)
         names = {name: k for name, k in ids.items() if str(k) != str(name)}
-        pairs = itertools.combinations(ids.values(), 2)
+        pairs = combinations(ids.values(), 2)
         return _make_topology(ids.values(), pairs, names=names, radius=self.radius)
 
 

@@ -10,6 +10,7 @@ import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -167,7 +168,7 @@ class _Search:
         while math.comb(count, size) > MAX_SETS:
             count = max(size, int(0.9 * count))
         # All sets, as rows of indices into ``ranked``; those that cannot matter are dropped.
-        numbers = itertools.chain.from_iterable(itertools.combinations(range(count), size))
+        numbers = itertools.chain.from_iterable(combinations(range(count), size))
         chosen = np.fromiter(numbers, np.intp, math.comb(count, size) * size).reshape(-1, size)
         needed = np.array([c.needed for c in ranked[:count]], dtype=np.intp)
         # A message that needs k messages, itself included, needs one of each lower number: sorted,
@@ -204,6 +205,6 @@ class _Search:
                     a, b = pair
                     interaction = pair_gain - single_gains[a] - single_gains[b]
                     interactions[index_of_key[a], index_of_key[b]] = interaction
-            for i, j in itertools.combinations(range(size), 2):
+            for i, j in combinations(range(size), 2):
                 gains += interactions[members[:, i], members[:, j]]
         return gains

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import date
 from datetime import time as clock_time
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -112,7 +113,7 @@ def _text(value: Any) -> str:
 
 def _require_apart(keys: list[str]) -> None:
     """Raise ScenarioError if a key sets again what an earlier one has varied."""
-    for first, key in itertools.combinations(keys, 2):
+    for first, key in combinations(keys, 2):
         if replaces_key(key, first):
             rule = f"{key} replaces the values of {first}, which is varied before it"
             remedy = (

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from itertools import combinations_with_replacement
 
 import numpy as np
 
@@ -51,7 +52,7 @@ def steady_tracks(scenario: Scenario) -> tuple[FloatArray, float]:
         closed.append(np.eye(n) - K @ H)
         noises.append(K @ R @ K.T)
     joint = np.zeros((len(closed), len(closed), n, n))
-    for (i, C), (j, D) in itertools.combinations_with_replacement(enumerate(closed), 2):
+    for (i, C), (j, D) in combinations_with_replacement(enumerate(closed), 2):
         # P_ij = C_i (F P_ij F' + Q) C_j' + [i = j] K R K', solved by vectorisation.
         driven = C @ Q @ D.T + (noises[i] if i == j else 0.0)
         block = np.linalg.solve(np.eye(n * n) - np.kron(C @ F, D @ F), driven.reshape(-1))
