@@ -38,6 +38,7 @@ from netkf.studies.innovations import (
     ClockedInnovations,
     JudgedBlock,
     has_clocked_innovations,
+    has_linear_innovations,
     nis_of,
     readings_of_block,
 )
@@ -223,8 +224,7 @@ class _Innovations:
     def of_block(self, block: JudgedBlock, blurred: np.ndarray) -> Iterator[tuple[float, float]]:
         """Yield NIS of a block and its expected value, without ``blurred`` samples (T,)."""
         scenario, i, placed = self._scenario, block.node, readings_of_block(self._scenario, block)
-        # A nonlinear reading has no H given the errors alone.
-        if not placed or not scenario.is_linear:
+        if not placed or not has_linear_innovations(scenario):
             return
         sensors = [scenario.slot_path(self._streams, self._run.nodes[i], p) for p in placed]
         laws = [

@@ -52,10 +52,16 @@ def nis_of(
     return float(v @ np.linalg.solve(S, v)), expected
 
 
+def has_linear_innovations(scenario: Scenario) -> bool:
+    """Return True if errors alone give innovations: readings are linear, and used as they are."""
+    linear = scenario.plant.linear and scenario.has_linear_sensors
+    return linear and not scenario.faults and scenario.filter.gate is None
+
+
 def readings_of_block(scenario: Scenario, block: JudgedBlock) -> tuple[Any, ...]:
     """Return the node's sensors that read a block, and nothing that it does not estimate."""
     placed = scenario.placed_sensors.get(scenario.nodes[block.node], ())
-    if not block.block or not scenario.is_linear:
+    if not block.block or not has_linear_innovations(scenario):
         return placed
     view = np.arange(scenario.plant.n)[scenario.view(block.node)]
     supports = [(sensor, scenario.support(sensor)) for sensor in placed]
@@ -73,9 +79,9 @@ def readings_of_block(scenario: Scenario, block: JudgedBlock) -> tuple[Any, ...]
 
 def has_clocked_innovations(scenario: Scenario) -> bool:
     """Return True if innovations under clocks follow from states at events."""
-    if scenario.slotted or not scenario.is_linear or scenario.increment_sensors:
-        return False
     plant: Any = scenario.plant
+    if scenario.slotted or not has_linear_innovations(scenario) or scenario.increment_sensors:
+        return False
     if len(plant.changes) or scenario.misses_input or not scenario.is_random:
         return False
     if scenario.has_mistimed_models:

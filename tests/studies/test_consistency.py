@@ -356,6 +356,27 @@ def test_nis_under_clocks_is_that_of_samples(tmp_path):
     assert found.expected_nis[blocks[2, "pose@3"]] <= 1.0 + 1e-9
 
 
+def test_nodes_with_wrong_clocks_have_nis_of_what_they_predict(tmp_path):
+    """Readings are a second apart by the clock of node 1, and so are its predictions."""
+    lost = {"loss": {"kind": "bernoulli", "delivery": 0.0}}
+    clocks = [{"nodes": [1], "drift": 0.25}]
+    alone = load(CLOCKED, tmp_path, network__channel=lost, network__clocks=clocks)
+    times = np.arange(1, 15) / 1.25
+    seen = replica_consistency(alone, 3, 2)
+    run = netkf.simulate(alone.replace({"probe": times.tolist()}), seed=3, replica=2)
+    path = alone.sample_path(Streams(3, 2), 1, alone.placed_sensors[1][0])
+    F, values, x, P = np.exp(-0.1), [], 0.0, 1.0
+    for k in range(14):
+        x, P = F * x, F * P * F + 0.25 * (1.0 - np.exp(-0.2)) / 0.2
+        y = path.reading(k, run.x[k])[0][0]
+        values.append((y - x) ** 2 / (P + 0.1))
+        x, P = x + P / (P + 0.1) * (y - x), P * 0.1 / (P + 0.1)
+    assert seen.nis[0] == pytest.approx(np.mean(values))
+    # Errors hold the state, of which no covariance is known.
+    assert np.isnan(seen.expected_nis[0])
+    assert np.isfinite(seen.nis[1:]).all() == np.isfinite(seen.expected_nis[1:]).all()
+
+
 def test_nodes_that_sample_at_times_of_their_own_have_innovations_each(ring, monkeypatch):
     """As many as nodes that sample together, and fewer where the network is large: that of 1000
     nodes was refused, as if its user had asked for too many probe times.
@@ -385,3 +406,17 @@ def test_runs_in_which_a_node_reads_nothing_do_not_hide_its_innovations(ring):
     found = judge_consistency(scenario, runs, 0.99)
     assert np.isfinite(found.table["nis"][:3]).all()
     assert np.isnan(found.table["nis"][3:]).all()
+
+
+def test_messages_of_few_bits_leave_nis_to_be_judged():
+    """Predictions are those of the trace: their NIS follows from errors, P and readings."""
+    few = netkf.load(GOSSIP, {"horizon": 40.0, "network.quantise": {"bits": 5, "range": 8.0}})
+    found, run = replica_consistency(few, 3, 0), netkf.simulate(few, 3)
+    path = few.slot_path(Streams(3, 0), 0, few.placed_sensors[0][0])
+    R, values = few.noise_covariance(few.placed_sensors[0][0].entry, believed=True), []
+    for k in range(1, len(run.times)):
+        H, P = path.matrix(k), run.P[k, 0]
+        e = path.reading(k, run.x[k]) - H @ run.xhat[k, 0]
+        values.append(e @ np.linalg.solve(H @ P @ H.T + R, e))
+    assert found.nis[0] == pytest.approx(np.mean(values))
+    assert np.isnan(found.expected_nis[0])
