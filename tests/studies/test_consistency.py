@@ -410,7 +410,9 @@ def test_runs_in_which_a_node_reads_nothing_do_not_hide_its_innovations(ring):
 
 def test_messages_of_few_bits_leave_nis_to_be_judged():
     """Predictions are those of the trace: their NIS follows from errors, P and readings."""
-    few = netkf.load(GOSSIP, {"horizon": 40.0, "network.quantise": {"bits": 5, "range": 8.0}})
+    few = netkf.load(
+        GOSSIP, {"horizon": 40.0, "probe": 1.0, "network.quantise": {"bits": 5, "range": 8.0}}
+    )
     found, run = replica_consistency(few, 3, 0), netkf.simulate(few, 3)
     path = few.slot_path(Streams(3, 0), 0, few.placed_sensors[0][0])
     R, values = few.noise_covariance(few.placed_sensors[0][0].entry, believed=True), []
