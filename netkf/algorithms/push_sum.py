@@ -49,7 +49,7 @@ from netkf.algorithms.starts import check_information, information_notes
 from netkf.algorithms.traits import Analysis, Needs, Timing
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import boolean, field, integer, node_id, number, one_of, positive
-from netkf.linalg.arrays import FloatArray, square_root, symmetric
+from netkf.linalg.arrays import FloatArray, is_definite, square_root, symmetric
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import (
     ONE,
@@ -668,7 +668,8 @@ class PushSum(Filter):
                 f"filter.{f.name}" for f in fields if getattr(self, f.name) != f.default
             ]
             reason = "not used under clocks, where push-sum keeps running sums"
-            return (f"{', '.join(changed_settings)}: {reason}",) if changed_settings else ()
+            unused = (f"{', '.join(changed_settings)}: {reason}",) if changed_settings else ()
+            return (*unused, *digit_notes(scenario))
         # Contraction is enough to run; the theorems ask for more.
         radius = scenario.topology.laplacian_radius
         notes = information_notes(scenario)
@@ -679,6 +680,19 @@ class PushSum(Filter):
             f"filter.delta = {self.delta:g} is below rho(L) = {radius:.6g}: averaging contracts, "
             "but P Theorems 3, 5 and 6 ask for more than rho(L)",
         )
+
+
+def digit_notes(scenario: Any) -> tuple[str, ...]:
+    """Return a note where sums keep the information of a P that was nearly singular at first."""
+    given, first = scenario.filter.cov, scenario.nodes[0]
+    starts = given if isinstance(given, tuple) else (scenario.initial_estimate(first)[1],)
+    driven = all(is_definite(Q) for (_, Q), *_ in scenario.estimated_pieces)
+    if driven or all(map(is_definite, starts)):
+        return ()
+    return (
+        "push-sum: P begins singular and the noise does not drive every state, so that the first "
+        "rounds tell of so much information that later sums lose digits; give filter.cov",
+    )
 
 
 def corrected_root(root: FloatArray, information: FloatArray) -> FloatArray:

@@ -3,6 +3,7 @@
 import pytest
 
 import netkf
+from netkf.scenario.reading import from_table
 from netkf.scenario.usage import record_usage, usage_notes
 from netkf.scenario.writing import resolve_defaults
 
@@ -240,6 +241,32 @@ def test_push_sum_says_what_it_does_not_use_under_clocks(build):
     filters = {"kind": "push-sum", "gamma": 3, "delta": 3.0}
     made = build(sensors=SAMPLED, filter=filters, network=network(CLOCKS["nodes"]))
     assert "filter.gamma, filter.delta: not used under clocks" in "\n".join(made.notes)
+
+
+@pytest.mark.parametrize(
+    ("B", "cov", "told"),
+    [
+        ([[0.0], [1.0]], [[0.0, 0.0], [0.0, 0.0]], True),
+        ([[0.0], [1.0]], [[1.0, 0.0], [0.0, 1.0]], False),
+        ([[1.0, 0.0], [0.0, 1.0]], [[0.0, 0.0], [0.0, 0.0]], False),
+    ],
+)
+def test_sums_of_a_start_that_is_nearly_certain_lose_digits(tmp_path, B, cov, told):
+    """P grows as a power of time at first, and sums keep its inverse."""
+    A = [[0.0, 1.0], [0.0, 0.0]]
+    sampled = {"nodes": [0, 1], "H": [[1.0, 0.0]], "R": [[1.0]], "sampling": SAMPLES}
+    table = {
+        "format": 1,
+        "name": "sums",
+        "horizon": 5.0,
+        "probe": 1.0,
+        "plant": {"kind": "diffusion", "A": A, "B": B, "cov": cov},
+        "sensors": [sampled],
+        "network": network(CLOCKS["nodes"]),
+        "filter": {"kind": "push-sum"},
+    }
+    notes = from_table(table, tmp_path).notes
+    assert any("lose digits; give filter.cov" in note for note in notes) == told
 
 
 def test_what_a_run_used_of_its_records(build, tmp_path):
