@@ -227,7 +227,7 @@ SLEEPS = [{"kind": "duty", "nodes": [1, 2], "period": 1.3, "up": 0.8, "memory": 
     [
         ("kcf", "nodes", {"H": H.tolist()}, []),
         ("intermittent", "readings", {"H": H.tolist()}, []),
-        ("gossip", "links", RANGES, SLEEPS),
+        pytest.param("gossip", "links", RANGES, SLEEPS, marks=pytest.mark.slow),
     ],
 )
 def test_linear_plants_are_those_whose_f_is_linear(

@@ -444,9 +444,9 @@ class Flow:
     ("kind", "keys"),
     [
         ("belief-propagation", {"steps": 2}),
-        ("hcmci", {"steps": 2}),
         ("gossip", {}),
-        ("track-fusion", {"rule": "ci"}),
+        pytest.param("hcmci", {"steps": 2}, marks=pytest.mark.slow),
+        pytest.param("track-fusion", {"rule": "ci"}, marks=pytest.mark.slow),
     ],
 )
 def test_beside_an_input_all_numbers_are_those_of_absolute_states(
