@@ -35,7 +35,7 @@ from netkf.algorithms.kernels.estimates import copy_vector, transform_root
 from netkf.algorithms.kernels.information import clear_part, copy_information_root
 from netkf.algorithms.kernels.intersection import finish_lanes, invert_lanes, merge_lanes
 from netkf.algorithms.kernels.run import ALL as ALL_RECEIVERS
-from netkf.algorithms.kernels.run import carry_mean, predict_estimate, shift_vector
+from netkf.algorithms.kernels.run import carry_mean, predict_estimate, shift_product, shift_vector
 from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.models import SlotModel
 from netkf.algorithms.modes import ModeFrame, flow_frame, slot_frame, still_frame
@@ -348,13 +348,8 @@ def shift(record: Any, h: int, run: Any) -> None:
 @kernel
 def shift_payload(record: Any, m: int, run: Any) -> None:
     """Move the centre in payload ``m``, as a state and, which may have been rounded, as an e."""
-    lanes, centre = run.lanes, record.payload.centre
     shift_vector(run, record.payload.xhat, m)
-    for i in range(record.growing):
-        total = load(lanes, centre, m, i)
-        for j in range(len(run.size)):
-            total += record.inverse[i, j] * load(lanes, run.offset, j)
-        store(lanes, centre, m, i, total)
+    shift_product(run, record.inverse, record.growing, record.payload.centre, m)
 
 
 def belief_propagation_record(

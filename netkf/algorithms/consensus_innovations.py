@@ -32,7 +32,7 @@ import numpy as np
 from netkf.algorithms.filter import Filter, NetworkInfo, NodeInfo
 from netkf.algorithms.kernels.estimates import transform_mean
 from netkf.algorithms.kernels.run import absorb as nothing
-from netkf.algorithms.kernels.run import shift_vector, write_innovation
+from netkf.algorithms.kernels.run import shift_product, shift_vector, write_innovation
 from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
@@ -350,27 +350,16 @@ def absorb(record: Any, h: int, run: Any) -> None:
 
 
 @kernel
-def shift_pseudo(record: Any, run: Any, y: FloatArray, k: int) -> None:
-    """Add G ``run.offset`` to ``y[k]``, an estimate of the pseudo-state."""
-    lanes = run.lanes
-    for i in range(len(run.size)):
-        total = load(lanes, y, k, i)
-        for j in range(len(run.size)):
-            total += record.G[i, j] * load(lanes, run.offset, j)
-        store(lanes, y, k, i, total)
-
-
-@kernel
 def shift(record: Any, h: int, run: Any) -> None:
     """Move the estimates of state and pseudo-state: gains multiply differences."""
     shift_vector(run, record.xhat, h)
-    shift_pseudo(record, run, record.pseudo, h)
+    shift_product(run, record.G, len(run.size), record.pseudo, h)
 
 
 @kernel
 def shift_payload(record: Any, m: int, run: Any) -> None:
     """Move the pseudo-state in payload ``m``."""
-    shift_pseudo(record, run, record.payload.pseudo, m)
+    shift_product(run, record.G, len(run.size), record.payload.pseudo, m)
 
 
 def consensus_innovations_record(

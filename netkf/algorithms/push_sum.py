@@ -684,10 +684,8 @@ class PushSum(Filter):
 
 def digit_notes(scenario: Any) -> tuple[str, ...]:
     """Return a note where sums keep the information of a P that was nearly singular at first."""
-    given, first = scenario.filter.cov, scenario.nodes[0]
-    starts = given if isinstance(given, tuple) else (scenario.initial_estimate(first)[1],)
     driven = all(is_definite(Q) for (_, Q), *_ in scenario.estimated_pieces)
-    if driven or all(map(is_definite, starts)):
+    if driven or scenario.singular_start is None:
         return ()
     return (
         "push-sum: P begins singular and the noise does not drive every state, so that the first "

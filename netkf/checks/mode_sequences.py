@@ -123,7 +123,7 @@ class SwitchedReference(RunSamples):
 
     @property
     def reference(self) -> Reference:
-        """That of all looks at the runs of a seed."""
+        """Covariances for all looks at the runs of a seed."""
         cls: Any = type(self)
         return _cached_reference(cls, self.scenario, self.seed)
 

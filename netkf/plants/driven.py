@@ -15,7 +15,7 @@ import numpy as np
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import apply
 from netkf.plants.readings import covariance_of, read_many, readings_of
-from netkf.plants.response import Response
+from netkf.plants.response import Response, moments_over
 
 
 class InputResponses(NamedTuple):
@@ -66,8 +66,7 @@ class DrivenTruth:
         moments: FloatArray = self._truth.moments(start, end)
         if self._over is None:
             return moments
-        pieces = self._over.over_pieces(np.array([start]), np.array([end]), self._truth.time_grid)
-        return np.asarray(moments + pieces[1][0, 1:])
+        return moments + moments_over(self._over, start, end, self._truth.time_grid)
 
     def states(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return local and absolute states (K, n) each at ``times`` (K,), in any order."""

@@ -161,6 +161,13 @@ class FlowResponse:
         return w[begins, :n], np.stack([stops, *sums], axis=1)
 
 
+def moments_over(response: Any, start: float, end: float, grid: TimeGrid) -> FloatArray:
+    """Return the two moments (2, n) of a ``response`` over [start, end] seconds, in which the plant
+    does not change, see ``paths``.
+    """
+    return np.asarray(response.over_pieces(np.array([start]), np.array([end]), grid)[1][0, 1:])
+
+
 class SlotResponse:
     """The response to the input of a ``plant`` in slots, moved by F (n, n) and G (n, m) of
     ``pieces``, the first before slot ``changes[0]``, the second from there on, and so on.

@@ -30,7 +30,7 @@ from netkf.algorithms.traits import Weights
 from netkf.core.errors import TheoryError
 from netkf.core.fields import probability
 from netkf.core.places import Place
-from netkf.linalg.arrays import FloatArray, block_diagonal, symmetric
+from netkf.linalg.arrays import FloatArray, block_diagonal, is_definite, symmetric
 from netkf.network.clocks import LinkClock
 from netkf.network.graphs import Link
 from netkf.plants.blocks import blocks_from
@@ -835,6 +835,12 @@ class DerivedScenario(ScenarioModel):
         view = self.model_view(index)
         # Without views all nodes share one object.
         return (xhat, P) if isinstance(view, slice) else (xhat[view], P[np.ix_(view, view)])
+
+    @cached_property
+    def singular_start(self) -> int | None:
+        """The first node (id) whose P at time 0 is singular; None if there is none."""
+        starts = ((node, self.initial_estimate(node)[1]) for node in self.nodes)
+        return next((node for node, P in starts if not is_definite(P)), None)
 
     def fresh_estimate(self, node: int, when: float) -> tuple[FloatArray, FloatArray]:
         """Return ``initial_estimate`` of a node that begins again ``when`` (s or slot)."""

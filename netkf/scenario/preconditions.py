@@ -237,9 +237,8 @@ def _check_common_start(scenario: DerivedScenario) -> None:
 
 
 def _check_invertible(scenario: DerivedScenario) -> None:
-    initial = {node: scenario.initial_estimate(node)[1] for node in scenario.nodes}
-    singular = next((node for node, P in initial.items() if not bool(is_definite(P))), None)
-    linear, of_nodes = scenario.plant.linear, scenario.estimated_pieces
+    singular, linear = scenario.singular_start, scenario.plant.linear
+    of_nodes = scenario.estimated_pieces
     if scenario.slotted:
         nonsingular = all(
             bool(is_definite(Q))
@@ -257,7 +256,7 @@ def _check_invertible(scenario: DerivedScenario) -> None:
     if not nonsingular:
         value = "a singular F"
         if singular is not None:
-            least = float(np.linalg.eigvalsh(initial[singular])[0])
+            least = float(np.linalg.eigvalsh(scenario.initial_estimate(singular)[1])[0])
             value = f"a singular one at node {singular} (least eigenvalue {least:.3g})"
         noise = "a positive definite Q" if scenario.slotted else "a B that drives every state"
         rule = f"must be positive definite for the {filter_name(scenario)}, which inverts "

@@ -521,6 +521,18 @@ def shift_vector(run: Any, x: FloatArray, k: int) -> None:
         store(run.lanes, x, k, i, load(run.lanes, x, k, i) + load(run.lanes, run.offset, i))
 
 
+@kernel
+def shift_product(run: Any, matrix: FloatArray, rows: int, x: FloatArray, k: int) -> None:
+    """Add the first ``rows`` of ``matrix`` (n, n) times ``run.offset`` (n, L) to those of
+    ``x[k]``.
+    """
+    for i in range(rows):
+        total = load(run.lanes, x, k, i)
+        for j in range(len(run.size)):
+            total += matrix[i, j] * load(run.lanes, run.offset, j)
+        store(run.lanes, x, k, i, total)
+
+
 # The standard verbs: those of a Kalman filter on the node's own readings, which sends estimates.
 
 

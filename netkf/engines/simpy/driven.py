@@ -11,6 +11,7 @@ import numpy as np
 from netkf.algorithms.filter import Filter
 from netkf.core.contracts import ContractError
 from netkf.linalg.arrays import FloatArray
+from netkf.plants.response import moments_over
 from netkf.scenario.scenario import Scenario
 
 
@@ -80,8 +81,7 @@ class DrivenModel:
         """Return the estimate (n,) after increments with these ``moments`` (2 p,), see ``Model``;
         those of the response to the input are known.
         """
-        start, end = np.array([self.start]), np.array([self.end])
-        of_m = self._response.over_pieces(start, end, self._grid)[1][0, 1:][:, self._view]
+        of_m = moments_over(self._response, self.start, self.end, self._grid)[:, self._view]
         known = of_m @ self._model.H.T
         local, m = moments - known.reshape(-1), self._m(self.end)
         return np.asarray(self._model.gain_update(xhat - m, root, local, gap) + m)

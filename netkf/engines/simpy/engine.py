@@ -113,8 +113,7 @@ class _Simulation:
             # A pooled filter has the increment sensors of all nodes.
             placed = [(k, p) for k in sensing for p in scenario.increment_sensors.get(k, ())]
             sensors = increment_sensors(scenario, streams, placed)
-            response: Any = None
-            clock = node_time(scenario, streams, node)
+            clock, response = node_time(scenario, streams, node), None
             if scenario.network.clocks and scenario.input_responses is not None:
                 response = scenario.input_responses.believed
             common = (timeline, self._recorder, truth, sensors, clock, response)

@@ -35,7 +35,7 @@ from netkf.network.node_clocks import NodeTime
 from netkf.plants.driven import moved_reading
 from netkf.plants.nonlinear import linearise_by_points
 from netkf.plants.readings import Stacked
-from netkf.plants.response import FlowResponse
+from netkf.plants.response import Response, moments_over
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES
 
@@ -394,7 +394,7 @@ class ClockedNode(Node):
         truth: Any,
         increments: list[Any],
         clock: NodeTime,
-        response: FlowResponse | None,
+        response: Response | None,
         *arguments: Any,
     ) -> None:
         """``response`` is that to the input which estimates are counted from: at the time of the
@@ -488,11 +488,9 @@ class ClockedNode(Node):
         x_moments = truth.moments(start, end)
         if self._response is not None:
             # Counted from the response over the time that passed by the clock.
-            true, known = (
-                self._response.over_pieces(np.array([a]), np.array([b]), self._clock.grid)[1][0, 1:]
-                for a, b in ((start, end), (self._now, shown))
-            )
-            x_moments = x_moments + true - known
+            response, grid = self._response, self._clock.grid
+            x_moments = x_moments + moments_over(response, start, end, grid)
+            x_moments -= moments_over(response, self._now, shown, grid)
         parts = [sensor.moments(truth, x_moments, start, end) for sensor in self._increments]
         # Stack the sensors: first moments of all rows, then the second ones.
         stacked = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
