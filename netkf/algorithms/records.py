@@ -278,12 +278,14 @@ class Records:
 
     struct : its fields are the arrays of the first block, ``payload`` and the settings
     arrays : of nodes (B, H, ..., L) and links (B, W, ..., L)
+    begin : ``begin(h, node)`` sets the entries of node h, by name, from its estimate
     links, past : names of those of links, and of past events
     numbers : which numbers are sent of the fields of ``payload``, as ``Record.numbers``
     """
 
     struct: Any
     arrays: dict[str, np.ndarray]
+    begin: Callable[[int, dict[str, np.ndarray]], None]
     links: tuple[str, ...] = ()
     past: tuple[str, ...] = ()
     numbers: Mapping[str, IntArray] = field(default_factory=dict)
@@ -293,6 +295,17 @@ class Records:
         links, which begin with ``first[h]``.
         """
         return slice(first[h], first[h + 1]) if name in self.links else h
+
+    def begin_elsewhere(
+        self, arrays: Mapping[str, np.ndarray], h: int, lane: int, moved: FloatArray
+    ) -> None:
+        """Let node ``h``, which is at its start, begin ``moved`` (n',) away from it in a lane of
+        the ``arrays`` of a block, by name.
+        """
+        # What refers to the start does too: no event moved the node from there.
+        node = {name: arrays[name][h, ..., lane] for name in arrays if name not in self.links}
+        node["xhat"][: len(moved)] += moved
+        self.begin(h, node)
 
     def copied(self) -> Any:
         """Return the struct of the first block with its own copies of the arrays of nodes and
@@ -342,10 +355,14 @@ def make_records(
     per_link = make_arrays(record.link, (blocks, links), lanes)
     for name, value in record.link_start.items():
         per_link[name][...] = np.asarray(value)[..., None]
-    for h, ((mean, root), info, model) in enumerate(zip(starts, infos, models, strict=True)):
+
+    def begin(h: int, node: dict[str, np.ndarray]) -> None:
+        kernels.begin(filtering, node, infos[h], models[h])
+
+    for h, (mean, root) in enumerate(starts):
         views = {name: array[0, h, ..., 0] for name, array in nodes.items()}
         views["xhat"][...], views["root"][...] = mean, root
-        kernels.begin(filtering, views, info, model)
+        begin(h, views)
     for array in nodes.values():
         # All runs start alike.
         array[:] = array[:1, ..., :1].copy()
@@ -365,9 +382,8 @@ def make_records(
         **({"root": triangle_numbers(n)} if "root" in record.payload else {}),
         **record.numbers,
     }
-    return Records(
-        record_class(name, values)(**values), arrays, tuple(per_link), tuple(record.past), numbers
-    )
+    struct, past = record_class(name, values)(**values), tuple(record.past)
+    return Records(struct, arrays, begin, tuple(per_link), past, numbers)
 
 
 def double_past(record: Any, names: Sequence[str]) -> None:

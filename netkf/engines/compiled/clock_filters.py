@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -69,9 +68,6 @@ class ClockFilters:
         links = _links_by_receiver(scenario)
         starts = list(zip(start.xhat, start.root, strict=True))
         count, self._common = len(links["sender"]), common_table(scenario)
-        algorithm: Any = scenario.node_filter
-        self._begin = partial(algorithm.kernels.begin, algorithm)
-        self._believed = list(zip(infos, models, strict=True))
         self.records = make_records(
             scenario.node_filter,
             starts,
@@ -150,11 +146,8 @@ class ClockFilters:
             place = self.records.place(name, h, self.run.first)
             getattr(self.record, name)[place] = getattr(self.start, name)[place]
         if moved.any():
-            # The start itself is elsewhere, also for what remembers its past: no event moved it.
-            known = set(self.records.arrays).difference(self.records.links)
-            views = {name: getattr(self.record, name)[h, ..., 0] for name in known}
-            views["xhat"][: len(moved)] += moved
-            self._begin(views, *self._believed[h])
+            arrays = {name: getattr(self.record, name) for name in self.records.arrays}
+            self.records.begin_elsewhere(arrays, h, 0, moved)
 
     def begin_piece(self, piece: int) -> None:
         """Let nodes believe the models of a piece of the plant, to whose begin they are

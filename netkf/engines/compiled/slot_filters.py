@@ -165,14 +165,15 @@ class SlotFilters:
         for name, array in self.records.arrays.items():
             place = self.records.place(name, h, self._setup.links.first)
             array[:, place] = self._start[name][:, place]
-        if moved.any():
-            self.shift_lane(h, slice(None), moved)
+        self.begin_elsewhere(h, 0, moved)
 
-    def shift_lane(self, h: int, lane: Any, offset: FloatArray) -> None:
-        """Add ``offset`` (n,) to the first states of filter ``h`` in a lane of the first block."""
-        self._run.offset[:] = 0.0
-        self._run.offset[: len(offset), lane] = offset.reshape(-1, *([1] * isinstance(lane, slice)))
-        call_kernel(self.kernels.shift, self.records.struct, h, run=self._run)
+    def begin_elsewhere(self, h: int, lane: int, moved: FloatArray) -> None:
+        """Let filter ``h``, which is at its start, begin ``moved`` (n,) away from it in a lane of
+        the first block.
+        """
+        if moved.any():
+            first = {name: array[0] for name, array in self.records.arrays.items()}
+            self.records.begin_elsewhere(first, h, lane, moved)
 
     def observe(self) -> None:
         """Write into the record of each node of the first block what exchanges conserve, now."""

@@ -94,10 +94,7 @@ class LinearVerbs:
                 raise TheoryError(f"{rule}, and {name} is {array.dtype}; declare it as one of them")
         self._lay_out(arrays, {})
         self._start = {name: array.copy() for name, array in arrays.items()}
-        self._start_means = {
-            name: (array[0] - self._view(name)).copy()
-            for name, array in with_means.records.arrays.items()
-        }
+        self._begun = {name: array[0].copy() for name, array in with_means.records.arrays.items()}
         self._set_means()
         self._offset_places = np.column_stack([np.full(self.n, -1), np.arange(self.n)])
         self._own_places = np.column_stack([np.zeros(self._p, dtype=np.int64), np.arange(self._p)])
@@ -132,8 +129,8 @@ class LinearVerbs:
         return words.view(self._dtypes[name]).reshape(shape)
 
     def _set_means(self) -> None:
-        for name, means in self._start_means.items():
-            difference = means.reshape(-1)
+        for name, begun in self._begun.items():
+            difference = (begun - self._start[name]).reshape(-1)
             words = self._begin[name] + np.flatnonzero(difference)
             rows = self._row[words] = self.forms.take(len(words))
             self.forms.table[rows, MEAN] = difference[difference != 0]
@@ -287,10 +284,13 @@ class LinearVerbs:
         """Let node ``h`` begin again, in coordinates that have ``moved`` (n,) since time 0."""
         first, forms = self.run.first, self.forms
         forms.table[self.xhat_rows[h]] = 0.0
-        for name, means in self._start_means.items():
+        begun_elsewhere = {name: array.copy() for name, array in self._begun.items()}
+        self.clocked.records.begin_elsewhere(begun_elsewhere, h, 0, moved)
+        for name, array in begun_elsewhere.items():
             shape, place = self._shapes[name], slice(h, h + 1)
             if name in self._links:
                 place = slice(first[h], first[h + 1])
+            means = array[place] - self._start[name][place]
             words = self._begin[name] + np.arange(math.prod(shape)).reshape(shape)[place]
             rows = self._row[words]
             if name != "xhat":
@@ -299,14 +299,10 @@ class LinearVerbs:
             # The past may have grown.
             begun = words[:, : means.shape[1]]
             self._stored[begun] = self._start[name][place].view(np.float64)
-            linear = begun[means[place] != 0.0]
+            linear = begun[means != 0.0]
             missing = linear[self._row[linear] < 0]
             self._row[missing] = forms.take(len(missing))
-            forms.table[self._row[linear], MEAN] = means[place][means[place] != 0.0]
-        if moved.any():
-            offset = np.zeros((self.n, forms.used))
-            offset[: len(moved), MEAN] = moved
-            self.shift(h, 0.0, offset)
+            forms.table[self._row[linear], MEAN] = means[means != 0.0]
 
     def shift_message(self, m: int, offset: FloatArray) -> None:
         """Move message ``m`` with the origin, by ``offset`` (n, C) at the time of sending."""

@@ -107,8 +107,7 @@ class SlotColumns(ErrorColumns):
                 array[:, place] = self._start[name][place][..., ZERO : ZERO + 1]
                 array[0, place] = self._start[name][place]
             moved = scenario.prior_shift(setup.infos[h].node, before)
-            if moved.any():
-                self._filters.shift_lane(h, MEAN, moved)
+            self._filters.begin_elsewhere(h, MEAN, moved)
 
     def replay(self) -> Iterator[None]:
         """Replay the events of the run; yield at each of ``run.times``."""
