@@ -35,9 +35,11 @@ def blocks_by_key(blocks: Sequence[Place], n: int) -> dict[Key, Place]:
 
 
 def block_numbers(infos: Sequence[Any]) -> dict[Key, int]:
-    """Return a number for each block that nodes with these ``NodeInfo``, or their senders,
-    estimate.
+    """Return a number for each block that is estimated, if the ``NodeInfo`` of nodes say so, else
+    for those that these nodes or their senders estimate.
     """
+    if infos[0].numbers:
+        return dict(infos[0].numbers)
     seen = [places for info in infos for places in (info.blocks, *info.heard)]
     keys = [place.key for places in seen for place in places]
     return {key: number for number, key in enumerate(dict.fromkeys(keys))}

@@ -11,7 +11,7 @@ carried as roots, ``P = root root'``, so that wide and narrow directions keep th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
 from types import MappingProxyType
@@ -78,6 +78,10 @@ class NetworkInfo(NamedTuple):
     heard: tuple[tuple[int, ...], ...]
 
 
+UNKNOWN = 2**31
+"""``NodeInfo.instants`` where nothing is known."""
+
+
 class NodeInfo(NamedTuple):
     """Facts that a node may know about itself and the network at time 0.
 
@@ -97,6 +101,9 @@ class NodeInfo(NamedTuple):
     alone : no other node estimates one of these
     heard : the blocks of each of ``senders``, at their places in its own state
     forgets : it may go down and begin again with what it knew at time 0 (network.lives)
+    numbers : a number for each block that a node estimates, by name and owner (id)
+    instants : how many instants with readings a run has at most, as far as is known
+    most_pairs : how many readings of pairs an instant has at most, at any node, and their rows
     sampled : H (p, n) and R (p, p) of its sensors that take samples (in slots: of all) together, as
               the node believes them, where they are fixed; p = 0 without such sensors
     """
@@ -118,6 +125,9 @@ class NodeInfo(NamedTuple):
     whole: tuple[Any, ...] = ()
     heard: tuple[tuple[Any, ...], ...] = ()
     forgets: bool = False
+    numbers: Mapping[Key, int] = {}
+    instants: int = UNKNOWN
+    most_pairs: tuple[int, int] = (1, 1)
 
     def own_states(self, n: int) -> int:
         """Return how many of its n states are of its own blocks, which come first."""

@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from netkf.algorithms.blocks import block_numbers
-from netkf.algorithms.kernels.nonlinear_rows import linear_rows
+from netkf.algorithms.kernels.nonlinear_rows import NonlinearRows, linear_rows
 from netkf.algorithms.kernels.pairs import IN_PYTHON, Pairs, empty_pairs
 from netkf.linalg.arrays import FloatArray, enlarged
 from netkf.linalg.vector_functions import VectorFunction
+
+Kept = Mapping[int, tuple[Any, int]]
+"""Readings of pairs by number, each with how many states its node has."""
+NOTHING_KEPT: Kept = MappingProxyType({})
+
+
+def linear_part(pair: Any) -> tuple[FloatArray, FloatArray] | None:
+    """Return H (p, n) and H_other (p, n') of a reading of a pair; None if it is not linear."""
+    return getattr(pair.H, "linear", None)
 
 
 class PythonPairs:
@@ -21,10 +32,12 @@ class PythonPairs:
         heard = [sum(place.n for place in places) for places in info.heard]
         self._own, self._numbers = max(n, *heard, 1), block_numbers([info])
         seen = [place for places in (info.blocks, *info.heard) for place in places]
-        self._states, self._sizes = n, {place.key: place.n for place in seen}
+        self._states, self._info = n, info
+        self._sizes = {place.key: place.n for place in seen}
         self._n = self._own + max(self._sizes.values(), default=1)
         self._found: list[tuple[Any, int]] = []
-        self._functions: dict[int, VectorFunction] = {}
+        self._kept: Kept = {}
+        self._functions: dict[tuple[int, bool], VectorFunction] = {}
 
     def none(self) -> Pairs:
         """Return no readings."""
@@ -33,54 +46,111 @@ class PythonPairs:
     @property
     def columns(self) -> int:
         """The most states that a reading is of."""
-        return int(self._own)
+        return int(self._n)
 
-    def _room(self, count: int, p: int, first: Sequence[int]) -> Pairs:
+    def _rows(self, count: int, p: int) -> NonlinearRows:
         rows = linear_rows(count, p, np.full((1, self._n), -1))
         rows.matrix = np.zeros((p, 1 + self._n))
-        return empty_pairs(rows, self._own, np.array(first, dtype=np.int64))
+        return rows
 
-    def take(self, readings: Sequence[Any], senders: Sequence[Any]) -> tuple[Pairs, list[Any]]:
+    def _room(self, count: int, p: int, first: Sequence[int]) -> Pairs:
+        begins, known = np.array(first, dtype=np.int64), self._known
+        return empty_pairs(self._rows(count, p), self._own, begins, known, self._nothing)
+
+    @cached_property
+    def _known(self) -> NonlinearRows:
+        """What linearises readings that are kept."""
+        p = int(self._info.most_pairs[1])
+        rows = self._rows(1, p)
+        rows.kind[0, 0] = IN_PYTHON
+        rows.functions[0, 0, 0] = self._function(p, kept=True).address
+        return rows
+
+    @cached_property
+    def _nothing(self) -> FloatArray:
+        return np.zeros((1, 1, self._n, 1))
+
+    def know(self, *kept: Kept) -> None:
+        """Let kernels linearise these readings."""
+        self._kept = {number: one for part in kept for number, one in part.items()}
+
+    def keep(self, kept: Kept, numbers: Sequence[int]) -> Kept:
+        """Return those that were ``kept`` and those of the last ``take`` of the node's own, if
+        their numbers are among these.
+        """
+        first = self._first_number(kept)
+        taken = {first + k * self._info.nodes: one for k, one in enumerate(self._found)}
+        return {number: one for number, one in {**kept, **taken}.items() if number in numbers}
+
+    def _first_number(self, kept: Kept) -> int:
+        """Return a number that no reading has that is ``kept``, nor one of another node."""
+        nodes, place = int(self._info.nodes), int(self._info.place)
+        return (max((number // nodes for number in kept), default=0) + 1) * nodes + place
+
+    def take(
+        self, readings: Sequence[Any], senders: Sequence[Any], kept: Kept
+    ) -> tuple[Pairs, list[Any]]:
         """Return the pairs of ``readings`` (``single.Whitened``), brought by the payloads
-        ``senders`` but for the first, and readings with the values of pairs at the end of y.
+        ``senders`` but for the first, and readings with those of pairs behind their own rows; the
+        node has ``kept`` some.
         """
         self._found, rows, first, extended = [], [], [0], []
         sizes = [self._states, *(len(payload.sender.run.struct.size) for payload in senders)]
         # Readings of ``update`` come without senders.
         for reading, states in zip(readings, sizes, strict=True):
-            y = reading.y
+            p = len(reading.y)
             for pair in reading.pairs:
                 self._found.append((pair, states))
-                rows.append(len(y))
-                y = np.concatenate([y, pair.y])
+                rows.append(p)
+                p += len(pair.y)
             first.append(len(rows))
-            extended.append(reading._replace(y=y))
+            extended.append(self._extended(reading, p))
         p = max((len(pair.y) for pair, _ in self._found), default=1)
         pairs = self._room(len(rows), p, first)
+        step, number = self._info.nodes, self._first_number(kept)
         for k, (pair, _) in enumerate(self._found):
             pairs.row[k], pairs.length[k] = rows[k], len(pair.y)
             pairs.block[0, k] = self._numbers.get(pair.other, -1)
-            pairs.rows.kind[k, 0] = IN_PYTHON
-            pairs.rows.functions[k, 0, 0] = self._function(p).address
+            pairs.sensor[k], pairs.number[k] = 0, number + k * step
             pairs.rows.R[0, k] = enlarged(pair.R, p, p)
+            if linear_part(pair) is None:
+                pairs.rows.kind[k, 0] = IN_PYTHON
+                pairs.rows.functions[k, 0, 0] = self._function(p).address
         return pairs, extended
 
-    def _function(self, p: int) -> VectorFunction:
-        """Return the function of both estimates and a number of ``_found`` that gives z and J."""
+    def _extended(self, reading: Any, count: int) -> Any:
+        """Return a reading of ``count`` rows, with those of linear pairs behind its own."""
+        if not reading.pairs:
+            return reading
+        y, H, row = np.zeros(count), np.zeros((count, self._n)), len(reading.y)
+        y[:row], H[:row, : reading.H.shape[1]] = reading.y, reading.H
+        for pair in reading.pairs:
+            rows = slice(row, row + len(pair.y))
+            y[rows], row = pair.y, rows.stop
+            if (parts := linear_part(pair)) is not None:
+                for part, begin in zip(parts, (0, self._own), strict=True):
+                    end = min(begin + part.shape[1], self._n)
+                    H[rows, begin:end] = part[:, : end - begin]
+        return reading._replace(y=y, H=H, rows=len(reading.y))
+
+    def _function(self, p: int, kept: bool = False) -> VectorFunction:
+        """Return the function of both estimates and the number of a reading that is ``kept``, or of
+        ``_found``, that gives z and J.
+        """
 
         def linearised(x: FloatArray, _: FloatArray, number: float) -> FloatArray:
-            (pair, states), own = self._found[int(number)], self._own
-            size = self._sizes[pair.other]
-            z, H, H_other = pair.H(x[:states], x[own : own + size])
+            pair, states = self._kept[int(number)] if kept else self._found[int(number)]
+            own = self._own
+            z, H, H_other = pair.H(x[:states], x[own : own + self._sizes[pair.other]])
             made = np.zeros((p, 1 + self._n))
             made[: len(z), 0], made[: len(z), 1 : 1 + states] = z, H
             made[: len(z), 1 + own : 1 + own + H_other.shape[1]] = H_other
             return made
 
-        if p not in self._functions:
+        if (p, kept) not in self._functions:
             shapes = (self._n,), (p,), (p, 1 + self._n)
-            self._functions[p] = VectorFunction(linearised, shapes, is_kernel=False)
-        return self._functions[p]
+            self._functions[p, kept] = VectorFunction(linearised, shapes, is_kernel=False)
+        return self._functions[p, kept]
 
     def raise_error(self) -> None:
         """Raise the error of what linearises a reading, if a call has failed."""

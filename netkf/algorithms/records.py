@@ -154,6 +154,8 @@ class Kernels:
                once from this state on
     decides : ``emit`` may write 0 into ``run.sends`` at a node that others hear
     sends_readings : a message brings the sender's reading of that instant, ``run.heard``
+    keeps_pairs : name of the field of the record with the numbers of the readings of pairs that a
+                  node keeps to linearise them later; "": it keeps none
     remembers : the record has a ``past``
     counts_sends : ``emit`` changes the record, so that it is called even if no message arrives
     slotwise : ``prepare`` is called for one slot at a time
@@ -181,6 +183,7 @@ class Kernels:
     interval: Any = standard.max_increment_interval
     decides: bool = False
     sends_readings: bool = False
+    keeps_pairs: str = ""
     remembers: bool = False
     counts_sends: bool = False
     slotwise: bool = False

@@ -34,7 +34,7 @@ from netkf.algorithms.models import (
     first_root,
     whiten_reading,
 )
-from netkf.algorithms.python_pairs import PythonPairs
+from netkf.algorithms.python_pairs import NOTHING_KEPT, Kept, PythonPairs
 from netkf.algorithms.records import Kernels, Records, double_past, make_records
 from netkf.core.contracts import ContractError
 from netkf.linalg.addresses import call_kernel
@@ -43,11 +43,14 @@ from netkf.linalg.lanes import ONE
 
 
 class Whitened(NamedTuple):
-    """A reading of a node's own states, y (p,) and H (p, n), whitened, and those of pairs."""
+    """A reading of a node's own states, y (p,) and H (p, n), whitened, and those of pairs, whose
+    rows may stand behind the first ``rows``, by default all.
+    """
 
     y: FloatArray
     H: FloatArray
     pairs: tuple[Any, ...] = ()
+    rows: int | None = None
 
 
 _NO_READING = Whitened(np.zeros(0), np.zeros((0, 0)))
@@ -81,6 +84,19 @@ class Payload:
         root: FloatArray = self.root
         return root @ root.T
 
+    def number_to(self, receiver: int) -> int:
+        """Return which of its messages is for a ``receiver`` (id): the last one is for nodes that
+        the sender does not hear, or the only one.
+        """
+        last = len(next(iter(self.fields.values()))) - 1
+        link: int = self.sender.run.links.get(receiver, last)
+        return min(link, last)
+
+    def told_to(self, receiver: int) -> Payload:
+        """Return the message for a ``receiver`` (id) alone."""
+        k = self.number_to(receiver)
+        return self.with_fields({name: rows[k : k + 1] for name, rows in self.fields.items()})
+
     def with_fields(self, fields: dict[str, np.ndarray]) -> Payload:
         """Return a payload with these ``fields``, of the axes of those here."""
         return Payload(fields, self.reading, self.sender)
@@ -111,6 +127,7 @@ class NodeState:
     def __init__(self, kernels: Kernels, record: Any, changing: tuple[str, ...], run: Any) -> None:
         self.kernels, self.record, self.changing, self.run = kernels, record, changing, run
         self.reading: Any = None
+        self.held: Kept = {}
 
     def __getattr__(self, name: str) -> Any:
         """Return a field of the record for this node, without its axis of lanes."""
@@ -134,7 +151,7 @@ class NodeState:
     def __reduce__(self) -> tuple[Any, ...]:
         """Return what pickle needs to make the state again."""
         run, values = self.run, {name: getattr(self.record, name) for name in self.changing}
-        return _restored, (run.filtering, run.model, run.info, values, self.reading)
+        return _restored, (run.filtering, run.model, run.info, values, self.reading, self.held)
 
     @property
     def model(self) -> Any:
@@ -165,7 +182,7 @@ class NodeState:
         while self.run.past and int(new.kept[0, 0]) + events > new.room:
             double_past(new, self.run.past)
         state = NodeState(self.kernels, new, self.changing, self.run)
-        state.reading = self.reading
+        state.reading, state.held = self.reading, self.held
         return state
 
 
@@ -223,23 +240,25 @@ class Surroundings:
             self._piece = model.piece
             tables.F[:], tables.root_Q[:] = model.F, model.root_Q
 
-    def set_readings(self, readings: Sequence[Whitened], senders: Sequence[Any] = ()) -> None:
+    def set_readings(
+        self, readings: Sequence[Whitened], senders: Sequence[Any] = (), kept: Kept = NOTHING_KEPT
+    ) -> None:
         """Make these readings the numbers 0, 1, ... of the run; ``senders`` are the payloads that
-        bring those after the first.
+        bring those after the first, and the node has ``kept`` readings of pairs.
         """
         if self._pairs is not None:
-            self.struct.pairs, readings = self._pairs.take(readings, senders)
+            self.struct.pairs, readings = self._pairs.take(readings, senders, kept)
         run, most = self.struct, max((len(y) for y, *_ in readings), default=0)
         count, p = run.y.shape[:2]
         if len(readings) > count or most > p:
             count, p = max(count, len(readings)), max(p, most)
             run.y, run.H = np.zeros((count, p, 1)), np.zeros((count, p, run.H.shape[2], 1))
             run.rows, run.matrix = np.zeros(count, dtype=np.int64), np.arange(count)
-        for k, (y, H, _) in enumerate(readings):
+        for k, (y, H, _, rows) in enumerate(readings):
             run.y[k, : len(y), 0] = y
             run.H[k] = 0.0
             run.H[k, : len(H), : H.shape[1], 0] = H
-            run.rows[k] = len(H)
+            run.rows[k] = len(H) if rows is None else rows
 
     def set_inbox(self, own: Any, messages: Sequence[Any], slotted: bool) -> None:
         """Make these messages the inbox of the run; their readings are numbered after the
@@ -270,6 +289,17 @@ class Surroundings:
                 brought.append(message.payload)
         self.set_readings(readings, brought)
 
+    def know_pairs(self, new: NodeState, messages: Sequence[Any] = ()) -> None:
+        """Let kernels linearise what the node and the senders of ``messages`` have kept."""
+        if self._pairs is not None:
+            senders = [getattr(message.payload, "sender", new) for message in messages]
+            self._pairs.know(new.held, *(sender.held for sender in senders))
+
+    def keep_pairs(self, new: NodeState) -> None:
+        """Keep readings of pairs, of those that the node has just taken too, as its record does."""
+        if self._pairs is not None and (name := new.kernels.keeps_pairs):
+            new.held = self._pairs.keep(new.held, getattr(new.record, name).ravel().tolist())
+
     def raise_error(self) -> None:
         """Raise the error of what linearises a reading of a pair, if a call has failed."""
         if self._pairs is not None:
@@ -279,6 +309,13 @@ class Surroundings:
         """Let the filter set what it knows of a slot before the run."""
         if slot >= 0:
             self._prepare(self.filtering, record, [self.info], [self.model], slot, 1)
+
+    def set_time(self, time: float) -> None:
+        """Set the time in seconds of a reading, nan if that is not known."""
+        if self.clocked:
+            self.struct.now = time
+        elif math.isfinite(time):
+            self.struct.slot = round(time / self.period)
 
     def set_exchange(self, exchange: Any) -> None:
         """Set the circumstances of ``emit`` or ``absorb``."""
@@ -336,7 +373,9 @@ def begin_node(
     return NodeState(kernels, records.struct, fields, run)
 
 
-def _restored(filtering: Any, model: Any, info: Any, values: dict[str, Any], reading: Any) -> Any:
+def _restored(
+    filtering: Any, model: Any, info: Any, values: dict[str, Any], reading: Any, held: Kept
+) -> Any:
     """Return a state that was pickled."""
     n = values["xhat"].shape[1]
     state = begin_node(filtering, model, np.zeros(n), np.eye(n), info)
@@ -344,7 +383,7 @@ def _restored(filtering: Any, model: Any, info: Any, values: dict[str, Any], rea
         setattr(state.record, name, array)
     if state.run.past:
         state.record.room = values[state.run.past[0]].shape[1]
-    state.reading = reading
+    state.reading, state.held = reading, held
     return state
 
 
@@ -380,8 +419,10 @@ def update(state: NodeState, reading: Any) -> NodeState:
         whitened = Whitened(*whiten_reading(reading.y, reading.H, reading.R))
     whitened = whitened._replace(pairs=reading.pairs)
     # In slots a node without a sensor gets readings without rows.
-    surroundings.set_readings([whitened])
+    surroundings.set_readings([whitened], kept=state.held)
+    surroundings.set_time(reading.time)
     call_kernel(state.kernels.update, new.record, 0, run=run)
+    surroundings.keep_pairs(new)
     new.reading = whitened if len(whitened.y) or whitened.pairs else None
     return new
 
@@ -420,6 +461,7 @@ def absorb(state: NodeState, messages: Sequence[Any], exchange: Any) -> NodeStat
     surroundings.set_exchange(exchange)
     surroundings.prepare(record, exchange.slot)
     surroundings.set_inbox(new.reading, messages, exchange.slot >= 0)
+    surroundings.know_pairs(new, messages)
     if messages:
         fields = {}
         for name in type(record.payload).struct_fields:
@@ -473,9 +515,6 @@ def _fitted(field: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 def _field(payload: Any, name: str, receiver: int) -> np.ndarray:
     """Return a field of a payload, which may be a user's own, with axes of messages and lanes."""
     if isinstance(payload, Payload):
-        rows = payload.fields[name]
-        # The last is for nodes that the sender does not hear, or the only one.
-        last = len(rows) - 1
-        k = min(payload.sender.run.links.get(receiver, last), last)
-        return rows[k : k + 1]
+        k = payload.number_to(receiver)
+        return payload.fields[name][k : k + 1]
     return np.asarray(getattr(payload, name), dtype=np.float64)[None, ..., None]

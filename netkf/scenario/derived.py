@@ -15,7 +15,7 @@ from typing import Any, Self, TypeVar
 import numpy as np
 import scipy
 
-from netkf.algorithms.filter import NetworkInfo, NodeInfo, commutes
+from netkf.algorithms.filter import UNKNOWN, NetworkInfo, NodeInfo, commutes
 from netkf.algorithms.kernels.gains import longest_interval
 from netkf.algorithms.models import (
     ChangingFlowModel,
@@ -363,6 +363,12 @@ class DerivedScenario(ScenarioModel):
         counts = Counter(itertools.chain.from_iterable(self.estimated)) if self.plants else None
         whole = self.layout.places if self.node_filter.needs.coupled else ()
         places = dict(zip(self.nodes, map(self._own_blocks, range(len(self.nodes))), strict=True))
+        keys = [place.key for own in places.values() for place in own]
+        numbers = {key: number for number, key in enumerate(dict.fromkeys(keys))}
+        instants = UNKNOWN
+        if self.slotted:
+            instants = 2 + int(self.horizon / self.slot_plant.period)
+        most_pairs = self._most_pairs if self.node_filter.needs.blocks else (1, 1)
         return tuple(
             NodeInfo(
                 node, degrees[node], len(receivers(node)), len(self.nodes), own_weights[node],
@@ -371,6 +377,7 @@ class DerivedScenario(ScenarioModel):
                 self._own_sensors(k, sampled.get(node, ())), places[node],
                 self._is_alone(k, counts), whole,
                 tuple(places[i] for i in senders(node)), node in self.forgetful_nodes,
+                numbers, instants, most_pairs,
             )
             for k, node in enumerate(self.nodes)
         )  # fmt: skip
@@ -389,11 +396,32 @@ class DerivedScenario(ScenarioModel):
             first += place.n
         return tuple(places)
 
+    @property
+    def _most_pairs(self) -> tuple[int, int]:
+        """The most readings of pairs that an instant has at any node, and the most rows of one."""
+        counts, rows, blocks = [1], [1], self.layout.places
+        for node, view in zip(self.nodes, self.views or (), strict=self.views is not None):
+            counts.append(0)
+            for placed in self.placed_sensors.get(node, ()):
+                others = np.setdiff1d(self.support(placed), view)
+                if others.size:
+                    sensor, found = self.sensors[placed.entry], set(others.tolist())
+                    p = len(sensor.R)
+                    # Rows of one reading may be about several blocks, each of which is a pair.
+                    about = sum(not found.isdisjoint(range(b.first, b.first + b.n)) for b in blocks)
+                    each = min(about, p) if sensor.record is None else 1
+                    counts[-1] += each * (self.most_rows(node, placed) // p)
+                    rows.append(p)
+        return max(counts), max(rows)
+
     def most_rows(self, node: int, placed: PlacedSensor) -> int:
-        """Return the most rows of a sensor at one instant; a slot may have several readings."""
+        """Return the most rows of a sensor at one instant: a record may have several readings."""
         sensor = self.sensors[placed.entry]
-        if sensor.record is None or not self.slotted:
+        if sensor.record is None:
             return len(sensor.R)
+        if not self.slotted:
+            t = self.time_grid.snap(sensor.record.rows(node).t)
+            return len(sensor.R) * int(np.unique(t, return_counts=True)[1].max(initial=1))
         slots = sensor.record.slots(node, self.slot_plant.period)
         return len(sensor.R) * max(1, *map(len, slots.values()), 1)
 

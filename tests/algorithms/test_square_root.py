@@ -13,7 +13,7 @@ def test_reflections_make_an_array_triangular(seed, rows, columns):
     array = np.random.default_rng(seed).normal(size=(rows, columns))
     expected, work = reference.triangular_root(array), array.copy()
     for i in range(rows):
-        reflect(work, i, rows, columns)
+        reflect(work, i, i, rows, columns)
     found = np.tril(work[:, :rows])  # what is right of the diagonal is left as rubbish
     signs = np.where(np.diag(found) < 0.0, -1.0, 1.0)
     np.testing.assert_allclose(found * signs, expected, rtol=1e-10, atol=1e-12)

@@ -140,14 +140,19 @@ def test_radios_and_lives(tmp_path: Path, text: str) -> None:
     assert "restart" in set(run.events["kind"])
 
 
-KEPT = "block-cross-covariances"
+KEPT, PATHS = "block-cross-covariances", "block-belief-propagation"
 
 
 @pytest.mark.one_in(3)
 @pytest.mark.parametrize("linearise", ["ekf", "ukf"])
 @pytest.mark.parametrize(
     ("kind", "estimates"),
-    [("block-intersection", "own"), ("block-intersection", "own+neighbours"), (KEPT, "own")],
+    [
+        ("block-intersection", "own"),
+        ("block-intersection", "own+neighbours"),
+        (KEPT, "own"),
+        (PATHS, "own"),
+    ],
 )
 def test_readings_of_pairs(tmp_path: Path, kind: str, estimates: str, linearise: str) -> None:
     changes = {"filter__kind": kind, "filter__linearise": linearise}
@@ -158,6 +163,16 @@ def test_readings_of_pairs(tmp_path: Path, kind: str, estimates: str, linearise:
 @pytest.mark.parametrize("text", [ROBOTS, CLOCKED])
 def test_kept_cross_covariances(tmp_path: Path, text: str) -> None:
     assert_agree(load(text, tmp_path, filter={"kind": KEPT, "estimates": "own"}))
+
+
+@pytest.mark.parametrize("text", [ROBOTS, CLOCKED])
+def test_paths_of_a_few_instants(tmp_path: Path, text: str) -> None:
+    """Nodes forget, and remember nothing after a crash."""
+    channel = {"loss": {"kind": "bernoulli", "delivery": 0.7}, "symmetric": False}
+    lives = {"kind": "duty", "nodes": [2], "period": 5.0, "up": 4.0, "memory": "lost"}
+    filtering = {"kind": PATHS, "estimates": "own", "window": 3}
+    changes = {"network__lives": [lives], "network__channel": channel}
+    assert_agree(load(text, tmp_path, filter=filtering, **changes))
 
 
 PERIODIC = '\nsampling = { kind = "periodic", period = 0.7 }'

@@ -169,7 +169,7 @@ def _distance(gate: GateTables, p: int, n: int, factor: float) -> tuple[float, f
         for j in range(n):
             L[i, p + j] = gate.G[i, j]
     for i in range(p):
-        reflect(L, i, p, p + n)
+        reflect(L, i, i, p, p + n)
     distance = slope = 0.0
     for i in range(p):
         for k in range(i):

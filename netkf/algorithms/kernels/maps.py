@@ -200,7 +200,7 @@ def write_root(work: FloatArray, root: FloatArray, q: int) -> None:
     """
     n, columns = work.shape
     for i in range(n):
-        reflect(work, i, n, columns)
+        reflect(work, i, i, n, columns)
     for j in range(n):
         # Signs of columns are free: a nonnegative diagonal makes the root unique.
         sign = -1.0 if work[j, j] < 0.0 else 1.0

@@ -2,6 +2,8 @@
 
 A message brings the reading that its sender had (``run.heard``), and with it these. What a receiver
 makes of one is a linear reading ``z = J_own x_own + J_other x_other + v`` at the estimates of both.
+A filter that keeps readings (``Kernels.keeps_pairs``) keeps the ``sensor`` and ``number`` of each,
+and linearises it again later.
 """
 
 from __future__ import annotations
@@ -38,7 +40,10 @@ class Pairs(Struct):
                   those that are linear ``run.H`` (p, n) has n columns, and rows are white
     block : (S or 1, K), number of the other block in each slot of a plan, -1: nothing is read
     rows, places : NonlinearRows of K filters, and from where they read, (K, p, n, 1)
+    sensor, number : (K,), what takes each in ``known``, and what tells it from others that do
+    known, sources : NonlinearRows of all that take such readings, and from where, (S, p, n, 1)
     slot : number of the slot in the plan
+    origin : scratch (n,), from where the states of a pair are counted
     """
 
     first: IntArray
@@ -47,20 +52,39 @@ class Pairs(Struct):
     block: IntArray
     rows: NonlinearRows
     places: FloatArray
+    sensor: IntArray
+    number: IntArray
+    known: NonlinearRows
+    sources: FloatArray
+    origin: FloatArray
     own: int
     slot: int
 
 
-def empty_pairs(rows: NonlinearRows, own: int, first: IntArray) -> Pairs:
-    """Return pairs of nobody yet, for readings with these ``first`` ones."""
+def empty_pairs(
+    rows: NonlinearRows,
+    own: int,
+    first: IntArray,
+    known: NonlinearRows | None = None,
+    sources: FloatArray | None = None,
+) -> Pairs:
+    """Return pairs of nobody yet, for readings with these ``first`` ones; by default each is taken
+    by a sensor of its own, which ``rows`` describe.
+    """
     K, p = rows.kind.shape
+    places = np.zeros((K, p, len(rows.x), 1))
     return Pairs(
         first=first,
         row=np.zeros(K, dtype=np.int64),
         length=np.zeros(K, dtype=np.int64),
         block=np.full((1, K), -1),
         rows=rows,
-        places=np.zeros((K, p, len(rows.x), 1)),
+        places=places,
+        sensor=np.arange(K),
+        number=np.zeros(K, dtype=np.int64),
+        known=rows if known is None else known,
+        sources=places if sources is None else sources,
+        origin=np.zeros(len(rows.x)),
         own=own,
         slot=0,
     )
@@ -79,48 +103,68 @@ def block_of_pair(pairs: Pairs, k: int) -> int:
 
 
 @kernel
+def write_origin(pairs: Pairs, k: int) -> None:
+    """Write from where the states of pair ``k`` are counted now into ``pairs.origin`` (n,)."""
+    rows, slot = pairs.rows, min(pairs.slot, len(pairs.rows.origin) - 1)
+    of = min(k, len(rows.entries) - 1)
+    for j in range(len(pairs.origin)):
+        entry = rows.entries[of, j]
+        pairs.origin[j] = rows.origin[slot, entry] if entry >= 0 else 0.0
+
+
+@kernel
 def linearise_pair(pairs: Pairs, run: Any, r: int, k: int, q: int) -> None:
     """Write z, J and the covariance of the noise of pair ``k`` of reading number ``r`` in lane
     ``q`` into ``rows.value`` (p,), ``rows.J`` (p, n) and ``rows.C`` (p, p), at the estimates
     ``rows.x`` (n,).
     """
     rows, first, matrix = pairs.rows, run.first_y + r, run.first_H + run.matrix[r]
-    count, n, noise = pairs.length[k], len(rows.x), min(pairs.slot, len(rows.R) - 1)
+    count, noise = pairs.length[k], min(pairs.slot, len(rows.R) - 1)
     for i in range(count):
         row = pairs.row[k] + i
         rows.y[i] = rows.value[i] = run.y[first, row, q]
         for j in range(count):
             rows.C[i, j] = rows.R[noise, k, i, j]
-        for j in range(n if rows.kind[k, 0] == LINEAR else 0):
+        for j in range(len(rows.x) if rows.kind[k, 0] == LINEAR else 0):
             rows.J[i, j] = run.H[matrix, row, j, q]
+    if rows.kind[k, 0] != LINEAR:
+        write_origin(pairs, k)
+        linearise_at(pairs, rows, pairs.places, k, k, count)
+    leave_out_missing(rows, count)
+
+
+@kernel
+def linearise_at(
+    pairs: Pairs, rows: NonlinearRows, sources: FloatArray, k: int, number: int, count: int
+) -> None:
+    """Write z and J of the reading ``rows.y`` (p,) with a ``number``, of number ``k`` in ``rows``,
+    at the estimates ``rows.x`` (n,), which are counted from ``pairs.origin`` (n,).
+    """
+    n = len(rows.x)
     if rows.kind[k, 0] == IN_PYTHON:
-        call_function(rows.functions[k, 0, 0], rows.x, rows.y, float(k), 0.0, rows.matrix)
+        call_function(rows.functions[k, 0, 0], rows.x, rows.y, float(number), 0.0, rows.matrix)
         for i in range(count):
             rows.value[i] = rows.matrix[i, 0]
             for j in range(n):
                 rows.J[i, j] = rows.matrix[i, 1 + j]
-    elif rows.kind[k, 0] != LINEAR:
-        _linearise(pairs, rows, k, count)
+        return
+    for j in range(n):
+        rows.x[j] += pairs.origin[j]
+    read_rows(rows, k, sources, k, 0, rows.mean)
+    differentiate_rows(rows, k, sources, k, 0)
+    subtract_rows(rows, k, rows.y, rows.mean, rows.value)
+    for j in range(n):
+        rows.x[j] -= pairs.origin[j]
+        for i in range(count):
+            rows.value[i] += rows.J[i, j] * rows.x[j]
+
+
+@kernel
+def leave_out_missing(rows: NonlinearRows, count: int) -> None:
+    """Let values that are missing say nothing."""
     for i in range(count):
-        # A value that is missing says nothing.
         if math.isnan(rows.value[i]):
             rows.value[i] = 0.0
             rows.J[i, :] = 0.0
             rows.C[i, :] = rows.C[:, i] = 0.0
             rows.C[i, i] = 1.0
-
-
-@kernel
-def _linearise(pairs: Pairs, rows: NonlinearRows, k: int, count: int) -> None:
-    n, slot = len(rows.x), min(pairs.slot, len(rows.origin) - 1)
-    for j in range(n):
-        if rows.entries[k, j] >= 0:
-            rows.x[j] += rows.origin[slot, rows.entries[k, j]]
-    read_rows(rows, k, pairs.places, k, 0, rows.mean)
-    differentiate_rows(rows, k, pairs.places, k, 0)
-    subtract_rows(rows, k, rows.y, rows.mean, rows.value)
-    for j in range(n):
-        if rows.entries[k, j] >= 0:
-            rows.x[j] -= rows.origin[slot, rows.entries[k, j]]
-        for i in range(count):
-            rows.value[i] += rows.J[i, j] * rows.x[j]

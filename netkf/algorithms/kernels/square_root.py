@@ -40,31 +40,31 @@ def lower_root(root: FloatArray) -> FloatArray:
 
 
 @kernel
-def reflect(work: FloatArray, i: int, rows: int, columns: int) -> None:
-    """Apply, from the right and in place, the Householder reflection of the columns ``i`` to
-    ``columns`` - 1 of ``work`` (>= rows, >= columns) that zeroes row ``i`` right of its diagonal,
-    to the rows ``i`` to ``rows`` - 1. In row ``i`` itself the entries right of the diagonal are not
+def reflect(work: FloatArray, i: int, c: int, rows: int, columns: int) -> None:
+    """Apply, from the right and in place, the Householder reflection of the columns ``c`` to
+    ``columns`` - 1 of ``work`` (>= rows, >= columns) that zeroes row ``i`` right of column ``c``,
+    to the rows ``i`` to ``rows`` - 1. In row ``i`` itself the entries right of that column are not
     cleared: read them as zeros.
     """
     square = 0.0
-    for j in range(i, columns):
+    for j in range(c, columns):
         square += work[i, j] * work[i, j]
     # A zero row is triangular already.
     if square == 0.0:
         return
     # The sign opposite to the pivot's, so that the difference below does not cancel.
-    pivot = -math.copysign(math.sqrt(square), work[i, i])
-    # With v = row i - pivot e_i, scale = v'v / 2 and the reflection is I - v v' / scale.
-    scale = square - work[i, i] * pivot
-    work[i, i] -= pivot
+    pivot = -math.copysign(math.sqrt(square), work[i, c])
+    # With v = row i - pivot e_c, scale = v'v / 2 and the reflection is I - v v' / scale.
+    scale = square - work[i, c] * pivot
+    work[i, c] -= pivot
     for r in range(i + 1, rows):
         total = 0.0
-        for j in range(i, columns):
+        for j in range(c, columns):
             total += work[i, j] * work[r, j]
         total /= scale
-        for j in range(i, columns):
+        for j in range(c, columns):
             work[r, j] -= total * work[i, j]
-    work[i, i] = pivot
+    work[i, c] = pivot
 
 
 @kernel(inlined=True, fused=True)

@@ -60,9 +60,12 @@ class ClockFilters:
         infos = scenario.node_infos[:1] if pooled else scenario.node_infos
         self._own = own_sizes(infos, self._columns[1], pooled)
         self._readings = None
+        self._known_pairs: tuple[Any, ...] = (None, None)
         if not (linear := all(sensor.linear for sensor in scenario.sensors)):
             self._readings = nonlinear_sensors(scenario)
             self._p = self._readings.R.shape[1]
+            known = self._readings.setup.tables(scenario.filter.linearise, 1)
+            self._known_pairs = known, self._readings.sources()
         self._rates = [m for m in scenario.model_pieces[0] if isinstance(m, RateModel)]
         models = changing_models(wide_models(scenario), scenario.followed_changes.tolist())
         links = _links_by_receiver(scenario)
@@ -189,7 +192,8 @@ class ClockFilters:
             count = readings * self._samples
             rows = linear_rows(count, self._p, np.full((count, columns), -1))
             rows.R[0], rows.origin = np.eye(self._p), np.zeros((1, self._n))
-            pairs = empty_pairs(rows, own, np.zeros(1 + readings, dtype=np.int64))
+            first = np.zeros(1 + readings, dtype=np.int64)
+            pairs = empty_pairs(rows, own, first, *self._known_pairs)
         return {
             "pairs": pairs,
             "gate": self._gate_of_instants(),

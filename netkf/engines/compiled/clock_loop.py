@@ -303,6 +303,8 @@ def on_sample(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, 
     run.reading = OWN
     if verbs.gate != NOTHING:
         pass_instant(state, record, run, verbs, h, now)
+    if len(run.pairs.row) > 0:
+        whiten_pairs(state, run, OWN, instant)
     choose_model(state, run, verbs, h)
     call_at(verbs.update, record, h, run)
     state.nodes[h].reading = instant

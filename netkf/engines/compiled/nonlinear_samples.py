@@ -118,6 +118,7 @@ def set_pair(pairs: Pairs, k: int, table: NonlinearTable, s: int) -> None:
             rows.R[0, k, i, j] = table.R[table.noise[s], i, j]
         for j in range(table.matrices.shape[2]):
             pairs.places[k, i, j, 0] = table.matrices[matrix, i, j]
+    pairs.sensor[k] = table.sensor[s]
     copy_origin(rows, table, s)
 
 
@@ -142,6 +143,16 @@ class NonlinearSensors(NamedTuple):
     R: FloatArray
     sensors: list[tuple[Any, int, int]]
     anchors: list[int]
+
+    def sources(self) -> FloatArray:
+        """Return from where readings of pairs are measured, (2 S, p, n, 1)."""
+        count, (p, n) = len(self.sensors), (self.R.shape[1], self.columns.width)
+        made = np.zeros((2 * count, p, n, 1))
+        for k, (sensor, node, _) in enumerate(self.sensors):
+            if self.setup.kind[count + k, 0] != LINEAR:
+                anchor = node if self.anchors[k] < 0 else self.anchors[k]
+                made[count + k, :, :, 0] = self.setup.reference(sensor, anchor, count + k)
+        return made
 
 
 @once_per_scenario

@@ -172,6 +172,12 @@ class PairFunction(NamedTuple):
     entries: tuple[np.ndarray, slice]
     n: int
 
+    @property
+    def linear(self) -> tuple[FloatArray, FloatArray] | None:
+        """The matrices of both parts of the state, None if they depend on estimates."""
+        own, others = self.entries
+        return (self.H[:, own], self.H[:, others]) if isinstance(self.H, np.ndarray) else None
+
     def __call__(
         self, xhat: FloatArray, other: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:

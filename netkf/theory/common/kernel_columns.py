@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import Exchange, Filter, Message, PairReading, Reading
+from netkf.algorithms.single import Payload
 from netkf.linalg.arrays import FloatArray
 from netkf.theory.common.forms import MEAN
 
@@ -19,7 +20,7 @@ from netkf.theory.common.forms import MEAN
 class ColumnState(NamedTuple):
     """The ``means`` (k, C) by name of a filter's state or payload, this ``inner`` one, in which
     they mean nothing, and the values ``read`` (p, C) of the reading of this instant: of the
-    whitened one, and of each pair.
+    whitened one, and of each pair. Of means that are no vectors k counts all entries.
     """
 
     means: dict[str, FloatArray]
@@ -38,7 +39,7 @@ class KernelColumns:
     def __init__(self, algorithm: Filter) -> None:
         self._algorithm, self.timing = algorithm, algorithm.timing
         assert algorithm.kernels is not None
-        self._names = algorithm.kernels.means
+        self._names, self._changes = algorithm.kernels.means, algorithm.kernels.counts_sends
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: Any) -> ColumnState:
         """Return the state at time 0 from ``mean`` (n, C)."""
@@ -58,42 +59,49 @@ class KernelColumns:
 
     def update(self, state: ColumnState, reading: Reading) -> ColumnState:
         """Return the state after a reading with y (p, C)."""
-        still = tuple(_pair(pair, np.zeros(len(pair.y))) for pair in reading.pairs)
+        of_pairs = [pair.y for pair in reading.pairs]
 
         def updated(y: FloatArray, *x: FloatArray) -> Any:
-            given = reading._replace(y=y, pairs=still)
-            return self._algorithm.update(_given(state, iter(x)), given)
+            values = iter(x)
+            pairs = tuple(_pair(pair, next(values)) for pair in reading.pairs)
+            given = reading._replace(y=y, pairs=pairs)
+            return self._algorithm.update(_given(state, values), given)
 
-        means, inner = self._mapped(updated, [reading.y, *state.inputs])
+        means, inner = self._mapped(updated, [reading.y, *of_pairs, *state.inputs])
         y = reading.y
         if len(y):
             y = np.linalg.solve(np.linalg.cholesky(reading.R), y)
-        read = (y, *(pair.y for pair in reading.pairs))
+        read = (y, *of_pairs)
         return ColumnState(means, inner, read if inner.reading is not None else ())
 
     def emit(self, state: ColumnState, exchange: Exchange) -> tuple[ColumnState, Any]:
         """Return the state after sending, and the payload, None if nothing is sent."""
 
-        def sent(*x: FloatArray) -> Any:
-            return self._algorithm.emit(_given(state, iter(x)), exchange)[1]
+        def sent(part: int) -> Callable[..., Any]:
+            return lambda *x: self._algorithm.emit(_given(state, iter(x)), exchange)[part]
 
         inner, payload = self._algorithm.emit(state.inner, exchange)
+        new = state._replace(inner=inner)
+        if self._changes:
+            new = ColumnState(*self._mapped(sent(0), state.inputs), state.read)
         told = None
         if payload is not None:
-            told = ColumnState(*self._mapped(sent, state.inputs), state.read)
-        return state._replace(inner=inner), told
+            told = ColumnState(*self._mapped(sent(1), state.inputs), state.read)
+        return new, told
 
     def absorb(
         self, state: ColumnState, messages: Sequence[Message], exchange: Exchange
     ) -> ColumnState:
         """Return the state after all messages of this instant."""
-        told = [message.payload for message in messages]
+        receiver = state.inner.run.info.node
+        told = [_told_to(receiver, message.payload) for message in messages]
         inputs = [y for one in (state, *told) for y in one.inputs]
 
         def absorbed(*values: FloatArray) -> Any:
             given = iter(values)
             own = _given(state, given)
-            heard = [m._replace(payload=_given(m.payload, given)) for m in messages]
+            payloads = [_given(one, given) for one in told]
+            heard = [m._replace(payload=p) for m, p in zip(messages, payloads, strict=True)]
             return self._algorithm.absorb(own, heard, exchange)
 
         return ColumnState(*self._mapped(absorbed, inputs), state.read)
@@ -106,33 +114,53 @@ class KernelColumns:
         self, verb: Callable[..., Any], inputs: Sequence[FloatArray]
     ) -> tuple[dict[str, FloatArray], Any]:
         """Return the means (k, C) after a verb on ``inputs`` (k, C), and the inner state."""
-        ends = np.cumsum([len(part) for part in inputs])
+        ends, columns = np.cumsum([len(part) for part in inputs]), np.concatenate(list(inputs))
+        # What is 0 needs no column of the map.
+        used = np.flatnonzero(columns.any(axis=1))
 
         def called(x: FloatArray) -> tuple[Any, list[FloatArray]]:
             inner = verb(*np.split(x, ends[:-1]))
-            return inner, [np.array(getattr(inner, name)) for name in names]
+            return inner, [_mean(inner, name).ravel() for name in names]
 
         inner = verb(*np.split(np.zeros(ends[-1]), ends[:-1]))
         names = [name for name in self._names if name in inner._fields]
-        base = [np.array(getattr(inner, name)) for name in names]
-        units = [called(e)[1] for e in np.eye(ends[-1])]
-        columns = np.concatenate(list(inputs))
+        base = [_mean(inner, name).ravel() for name in names]
+        units = [called(e)[1] for e in np.eye(ends[-1])[used]]
         made = {}
         for k, (name, zero) in enumerate(zip(names, base, strict=True)):
-            unit = np.stack([one[k] - zero for one in units], axis=1)
-            made[name] = unit @ columns
+            unit = np.array([one[k] - zero for one in units]).reshape(len(used), len(zero))
+            made[name] = unit.T @ columns[used]
             made[name][:, MEAN] += zero
         return made, inner
 
 
+def _mean(inner: Any, name: str) -> FloatArray:
+    """Return what the means of a state or payload are, of all messages of that."""
+    return np.array(inner.fields[name] if isinstance(inner, Payload) else getattr(inner, name))
+
+
 def _given(state: ColumnState, values: Iterator[FloatArray]) -> Any:
     """Return the inner state, or payload, with the next ``values`` as means and readings."""
-    inner = state.inner._replace(**{name: next(values) for name in state.means})
+    given, inner = {name: next(values) for name in state.means}, state.inner
+    arrays = {name: x.reshape(_mean(inner, name).shape) for name, x in given.items()}
+    if isinstance(inner, Payload):
+        inner = inner.with_fields({**inner.fields, **arrays})
+    else:
+        inner = inner._replace(**arrays)
     if state.read:
         y = next(values)
         own = tuple(_pair(pair, next(values)) for pair in inner.reading.pairs)
         inner.reading = inner.reading._replace(y=y, pairs=own)
     return inner
+
+
+def _told_to(receiver: int, told: ColumnState) -> ColumnState:
+    """Return a payload of several messages without those that are for others."""
+    inner = told.inner.told_to(receiver)
+    count = len(next(iter(told.inner.fields.values())))
+    k = told.inner.number_to(receiver)
+    means = {name: x.reshape(count, -1, x.shape[1])[k] for name, x in told.means.items()}
+    return told._replace(means=means, inner=inner)
 
 
 def _pair(pair: PairReading, y: FloatArray) -> PairReading:
