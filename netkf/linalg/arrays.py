@@ -26,6 +26,7 @@ __all__ = [
     "is_definite",
     "is_semidefinite",
     "as_kernel_array",
+    "spectral_root",
     "square_root",
     "symmetric",
 ]
@@ -93,8 +94,22 @@ def is_definite(matrices: FloatArray) -> NDArray[np.bool_]:
 
 
 def square_root(matrix: FloatArray) -> FloatArray:
-    """Return a factor ``S`` (n, n) with ``S S' = matrix``, positive semidefinite (n, n); it may be
-    singular.
+    """Return a factor ``S`` (n, n) with ``S S' = matrix``, positive semidefinite (n, n), whatever
+    the units of its rows; it may be singular.
+    """
+    sizes = np.diagonal(matrix)
+    exponents = np.frexp(np.where(sizes > 0.0, sizes, 1.0))[1] // 2
+    units = np.ldexp(1.0, exponents)
+    scaled = matrix / units[:, None] / units
+    # Rows that are rounding of zero have no units: together they may be far from semidefinite.
+    if np.linalg.eigvalsh(scaled)[0] < -1e-12:
+        return spectral_root(matrix)
+    return np.asarray(units[:, None] * spectral_root(scaled))
+
+
+def spectral_root(matrix: FloatArray) -> FloatArray:
+    """Return :func:`square_root` with columns along the eigenvectors, by increasing eigenvalues:
+    the rounding of all rows is that of the largest.
     """
     # Eigenvalues instead of Cholesky, which fails for singular matrices.
     values, vectors = np.linalg.eigh(matrix)

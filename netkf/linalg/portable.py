@@ -12,7 +12,7 @@ from functools import cache
 
 import numpy as np
 
-from netkf.linalg.arrays import FloatArray, square_root, symmetric
+from netkf.linalg.arrays import FloatArray, spectral_root, square_root, symmetric
 from netkf.linalg.jacobi import diagonalise
 
 MAX_REFINED_STATES = 40
@@ -146,17 +146,20 @@ def pseudo_inverse(matrix: FloatArray, rcond: float) -> FloatArray:
 
 
 def noise_root(matrix: FloatArray) -> FloatArray:
-    """Return a factor ``S`` (n, n) with ``S S' = matrix`` (n, n), equal to ``square_root`` up to
+    """Return a factor ``S`` (n, n) with ``S S' = matrix`` (n, n), equal to ``spectral_root`` up to
     rounding but with the same bits on every CPU.
 
     The order and signs of its columns are those of LAPACK. Where the eigenvectors cannot be matched
     with LAPACK's (multiple eigenvalues have arbitrary ones), and for more than MAX_REFINED_STATES
-    states, the result is ``square_root``, with the bits of LAPACK.
+    states, the result is ``spectral_root``, with the bits of LAPACK, or ``square_root`` where that
+    has lost the rows of small units.
     """
     # LAPACK decides the order and the signs of columns, which do not depend on its last bits.
-    lapack_root = square_root(matrix)
+    lapack_root, sizes = spectral_root(matrix), matrix.diagonal()
+    lost = np.abs((lapack_root**2).sum(axis=1) - sizes) > 1e-9 * sizes
+    unmatched = square_root(matrix) if (lost & (sizes > 0.0)).any() else lapack_root
     if len(matrix) > MAX_REFINED_STATES:
-        return lapack_root
+        return unmatched
     values, vectors = eigenvectors(matrix)
     lengths = np.sqrt(product(lapack_root.T, lapack_root).diagonal())
     cosines = product(
@@ -167,7 +170,7 @@ def noise_root(matrix: FloatArray) -> FloatArray:
     is_zero = ~is_clear & (lengths <= 1e-7 * lengths.max(initial=0.0))
     unused = [k for k in range(len(matrix)) if k not in matches[~is_zero]]
     if not (is_clear | is_zero).all() or len(unused) != is_zero.sum():
-        return lapack_root
+        return unmatched
     matches[is_zero] = unused
     signs = np.where(cosines[matches, np.arange(len(matrix))] < 0.0, -1.0, 1.0)
     return np.asarray(vectors[:, matches] * (signs * np.sqrt(np.maximum(values, 0.0))[matches]))

@@ -10,6 +10,7 @@ import pytest
 import scipy.linalg
 
 from netkf.linalg import portable
+from netkf.linalg.arrays import square_root
 
 DIGEST = """
 import hashlib, sys
@@ -147,6 +148,22 @@ def test_factors_are_those_of_lapack(matrix):
     np.testing.assert_allclose(root, scipy.linalg.sqrtm(matrix).real, atol=1e-10)
     inverse = portable.pseudo_inverse(matrix, 1e-13)
     np.testing.assert_allclose(inverse @ matrix, np.eye(n), atol=1e-9)
+
+
+@pytest.mark.parametrize("copies", [1, 2, 8])
+def test_roots_have_the_digits_of_all_rows_whatever_their_units(copies):
+    """Metres beside radians a second: the units are no reason to lose the digits of a variance."""
+    random, units = np.random.default_rng(0), [1e-9, 1e2, 1e-5, 1e3, 1e-3, 1e-2]
+    own = np.corrcoef(random.normal(size=(6, 20))) * np.outer(units, units)
+    # Several alike have multiple eigenvalues, and many are too many to be refined.
+    matrix = np.kron(np.eye(copies), own)
+    sizes = np.tile(units, copies)
+    for root in (square_root(matrix), portable.noise_root(matrix)):
+        error = np.abs(root @ root.T - matrix) / np.outer(sizes, sizes)
+        assert error.max() < 1e-13
+    # What is rounding of zero has no units, and is far from semidefinite by itself.
+    matrix = np.array([[1e-33, 1e-16], [1e-16, 1.0]])
+    np.testing.assert_allclose(square_root(matrix) @ square_root(matrix).T, matrix, atol=1e-15)
 
 
 @pytest.mark.parametrize(
