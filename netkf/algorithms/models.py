@@ -216,13 +216,16 @@ class MapModel(SlotModel):
     """Slots of a plant that need not be linear: ``x[k+1] = f(x[k], u[k], t_k) + w``; F is nan.
 
     ``f`` and ``jacobian`` are the map and its Jacobian, ``u`` (S, m) the input of slots 0 to S - 1
-    as filters know it, and ``linearise`` is how they predict, "ekf", "ukf" or "ckf".
+    as filters know it, and ``linearise`` is how they predict, "ekf", "ukf" or "ckf". Q is the
+    first of ``noises``, of which the next one holds from each of the ``noise_slots`` on.
     """
 
     f: VectorFunction
     jacobian: VectorFunction
     u: FloatArray
     linearise: str
+    noises: Sequence[FloatArray]
+    noise_slots: Sequence[int]
 
     slot: ClassVar[int] = 0
     """The slot from which ``predict`` begins; engines say it by ``move_to``, of a copy."""
@@ -249,7 +252,8 @@ class MapModel(SlotModel):
             weight=weight,
             center=center,
             u=np.array(self.u, order="C"),
-            root_Q=enlarged(self.root_Q, width, width),
+            roots=np.stack([enlarged(first_root(Q), width, width) for Q in self.noises]),
+            changes=np.array(self.noise_slots, dtype=np.int64),
             x=np.zeros(n),
             moved=np.zeros(n),
             J=np.zeros((n, n)),
@@ -400,7 +404,8 @@ class RateModel(FlowModel):
 
     ``f`` and ``jacobian`` are the rate of change and its Jacobian, ``step`` is the longest step of
     their integration (s), ``tables_of_input`` has the ``times``, ``values`` and ``sine`` of the
-    input as filters know it (``RateTables``), and ``linearise`` is how they predict.
+    input as filters know it (``RateTables``), and ``linearise`` is how they predict. Q is the
+    first of ``noises``, of which the next one holds from each of the ``noise_times`` (s) on.
     """
 
     f: VectorFunction
@@ -408,6 +413,8 @@ class RateModel(FlowModel):
     step: float
     tables_of_input: tuple[FloatArray, FloatArray, FloatArray]
     linearise: str
+    noises: Sequence[FloatArray]
+    noise_times: FloatArray
 
     now: ClassVar[float] = 0.0
     """The end of predictions in seconds; engines say it by ``move_to``, of a copy."""
@@ -430,7 +437,9 @@ class RateModel(FlowModel):
             times=times,
             values=values,
             sine=sine,
-            Q=np.array(self.Q, order="C"),
+            Q=np.stack(self.noises),
+            changes=np.array(self.noise_times),
+            piece=0,
             **scratch_of_rates(len(self.Q), values.shape[1]),
         )
 

@@ -33,6 +33,19 @@ def add_matmul(c: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 @kernel
+def count_until(changes: np.ndarray, value: float) -> int:
+    """Return how many of increasing ``changes`` (C,) are at most ``value``."""
+    low, high = 0, len(changes)
+    while low < high:
+        middle = (low + high) // 2
+        if changes[middle] <= value:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@kernel
 def solve_inplace(L: FloatArray, out: FloatArray, n: int) -> None:
     """Replace the first ``n`` rows of ``out`` (>= n, c) by ``L^-1 out``, by Gaussian elimination
     with partial pivoting as in LAPACK; they become nan if L is singular.

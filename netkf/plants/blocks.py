@@ -308,11 +308,26 @@ def _stack_nonlinear(blocks: Sequence[Block]) -> Plant:
     }
     if not all(plant.is_random for plant in plants):
         shared["path"] = StackedStates(plants)
-    noise = block_diagonal([plant.Q if slotted else plant.B for plant in plants])
+    name = "Q" if slotted else "B"
+    noise = block_diagonal([getattr(plant, name) for plant in plants])
+    starts = {change.start for plant in plants for change in plant.schedule}
+    shared["schedule"] = [
+        {"from": start, name: block_diagonal([_noise_at(plant, name, start) for plant in plants])}
+        for start in sorted(starts)
+    ]
     if slotted:
         return NonlinearPlant(Q=noise, period=_one(blocks, "period"), **shared)
     curved = [block for block in blocks if not block.plant.linear]
     return NonlinearDiffusion(B=noise, step=_one(curved, "step"), **shared)
+
+
+def _noise_at(plant: Any, name: str, time: float) -> FloatArray:
+    """Return Q or B, by ``name``, of a plant at a ``time`` (seconds)."""
+    present: FloatArray = getattr(plant, name)
+    for change in plant.schedule:
+        if change.start <= time:
+            present = getattr(change, name)
+    return present
 
 
 def _check_beside_nonlinear(k: int, block: Block) -> None:
@@ -377,11 +392,12 @@ def _check_shapes(k: int, block: Block) -> None:
     shapes: dict[str, tuple[int, ...]] = {"mean": (n,), "cov": (n, n)}
     shapes |= {"Q": (n, n)} if is_slotted else {"B": (n, plant.B.shape[1])}
     given = [(name, name, getattr(plant, name)) for name in shapes]
-    for c, change in enumerate(plant.schedule if plant.linear else ()):
+    for c, change in enumerate(plant.schedule):
         given += [(f"schedule[{c}].{name}", name, one) for name, one in change.matrices.items()]
     shapes |= {"F": (n, n), "A": (n, n)}
     for key, name, value in given:
-        shape = (n, value.shape[-1]) if name in "BG" else shapes[name]
+        is_wide = name == "G" or (name == "B" and plant.linear)
+        shape = (n, value.shape[-1]) if is_wide else shapes[name]
         if value is not None and value.shape != shape:
             wanted, actual = (" x ".join(map(str, one)) for one in (shape, value.shape))
             why = f"because the state has {n} components"

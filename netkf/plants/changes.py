@@ -50,6 +50,20 @@ class LinearChange(PlantChange):
     G: FloatArray | None = field(matrix, default=None)
 
 
+@dataclass(frozen=True, eq=False)
+class MapChange(PlantChange):
+    """A change of ``Q`` (n, n)."""
+
+    Q: FloatArray | None = field(covariance, default=None)
+
+
+@dataclass(frozen=True, eq=False)
+class RateChange(PlantChange):
+    """A change of ``B`` (n, q)."""
+
+    B: FloatArray | None = field(matrix, default=None)
+
+
 def schedule_of(cls: type[PlantChange]) -> Rule:
     """Return the rule for a list of changes of class ``cls``, or tables of them, in the order of
     their times.

@@ -1,13 +1,14 @@
 """Plants in continuous time that need not be linear, dx = f(x, u(t), t) dt + B dw.
 
 The truth is drawn by the method SRA1 of Roessler (2010, SIAM J. Numer. Anal. 48): with step h it is
-of order 1.5 in the path and 2 in law. Steps begin at multiples of ``step`` and where the input
+of order 1.5 in the path and 2 in law. Steps begin at multiples of ``step`` and where the input or B
 jumps, so that states there depend on the plant and the seed alone; noise inside a step is drawn
 given that of the step, for samples first and then for probes.
 """
 
 from __future__ import annotations
 
+import bisect
 import itertools
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,6 +18,7 @@ import numpy as np
 from netkf.core.fields import boolean, field, matrix, seconds
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import apply
+from netkf.plants.changes import RateChange, matrices_of_pieces, schedule_of
 from netkf.plants.inputs import SineInput
 from netkf.plants.linear import Blocks
 from netkf.plants.maps import NonlinearStates
@@ -32,7 +34,7 @@ class NonlinearDiffusion(NonlinearStates):
 
     f     "unicycle" (x, y, heading, with speed and turn rate as input), "coordinated-turn" (x, y,
           vx, vy, turn rate, without input), or "module:Class", the rate of change
-    B     (n, q)
+    B     (n, q); ``schedule`` has others from some times on
     step  seconds: the truth is integrated in steps of this length, by a method of order 1.5 in the
           path, and filters integrate mean and covariance in steps that are no longer, by one of
           order 4
@@ -43,6 +45,7 @@ class NonlinearDiffusion(NonlinearStates):
 
     B: FloatArray = field(matrix)
     step: float = field(seconds)
+    schedule: tuple[RateChange, ...] = field(schedule_of(RateChange), default=())
     unknown: bool = field(boolean, default=False)  # type: ignore[misc]
 
     @property
@@ -52,8 +55,19 @@ class NonlinearDiffusion(NonlinearStates):
 
     @property
     def Q(self) -> FloatArray:
-        """The covariance B B' (n, n) of the noise over a second."""
+        """The covariance B B' (n, n) of the noise over a second, at first."""
         return np.asarray(self.B @ self.B.T)
+
+    @property
+    def noises(self) -> list[FloatArray]:
+        """The covariances ``B B'`` (n, n) before the first of ``schedule_times`` and after each."""
+        return [np.asarray(B @ B.T) for B in self._drives[1]]
+
+    @cached_property
+    def _drives(self) -> tuple[list[float], list[FloatArray]]:
+        """Times of ``schedule``, and B before the first and after each."""
+        pieces = matrices_of_pieces({"B": self.B}, self.schedule)
+        return self.schedule_times.tolist(), [piece["B"] for piece in pieces]
 
     @cached_property
     def tables_of_input(self) -> InputTables:
@@ -87,7 +101,7 @@ class NonlinearDiffusion(NonlinearStates):
         """Return the ends (K,) of the steps from 0 on, up to the first not before ``end``."""
         count = int(end / self.step) + 2
         even = self.time_grid.snap(self.step * np.arange(1, count + 1))
-        jumps = self.tables_of_input[0]
+        jumps = np.union1d(self.tables_of_input[0], self.schedule_times)
         ends = np.union1d(even, jumps[(jumps > 0.0) & (jumps < even[-1])])
         return np.asarray(ends[: int(np.searchsorted(ends, end)) + 1])
 
@@ -95,7 +109,8 @@ class NonlinearDiffusion(NonlinearStates):
         """Return the state (n,) ``length`` seconds after ``x`` (n,); ``noise`` (2, q) are the
         integrals of dw and, tilted, of P_1 dw over it (``sensors``).
         """
-        f, g = self.functions[0], self.B
+        times, drives = self._drives
+        f, g = self.functions[0], drives[bisect.bisect_right(times, time)]
         # The integral of w(s) - w(time) over the step is h / 2 (dw - tilted).
         dw, area = noise[0], 0.5 * length * (noise[0] - noise[1])
         slope = f(x, self._u(time), time, 0.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import bisect
+from abc import abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
@@ -12,8 +14,9 @@ from netkf.core.contracts import error_line
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import boolean, covariance, field, seconds
 from netkf.linalg.arrays import FloatArray
-from netkf.linalg.portable import apply
+from netkf.linalg.portable import apply, noise_root
 from netkf.linalg.vector_functions import VectorFunction
+from netkf.plants.changes import MapChange, matrices_of_pieces, schedule_of
 from netkf.plants.dynamics import MOTIONS, StackedDynamics, dynamics, functions_of
 from netkf.plants.linear import BLOCK, Blocks, SlotPlant
 from netkf.plants.states import RecordedStates
@@ -29,6 +32,16 @@ class NonlinearStates(RecordedStates):
     """Whether f is a map of one slot."""
 
     f: Any = field(dynamics)
+
+    @property
+    def changes(self) -> FloatArray:
+        """(0,), as f knows the time: only noise changes, see ``noises``."""
+        return np.zeros(0)
+
+    @property
+    @abstractmethod
+    def noises(self) -> list[FloatArray]:
+        """Q (n, n) before the first of ``schedule_times`` and after each."""
 
     @property
     def m(self) -> int:
@@ -62,7 +75,7 @@ class NonlinearPlant(NonlinearStates, SlotPlant):
     f       "unicycle" (x, y, heading, with speed and turn rate as input; over a period with both
             held the path is an arc), "coordinated-turn" (x, y, vx, vy, turn rate, without input),
             or "module:Class", the map of one slot
-    Q       (n, n)
+    Q       (n, n); ``schedule`` has others from some times on
     period  seconds
 
     Headings are not wrapped: they count whole turns. With a ``path`` the states are recorded, and
@@ -73,12 +86,23 @@ class NonlinearPlant(NonlinearStates, SlotPlant):
 
     Q: FloatArray = field(covariance)
     period: float = field(seconds)
+    schedule: tuple[MapChange, ...] = field(schedule_of(MapChange), default=())
     unknown: bool = field(boolean, default=False)  # type: ignore[misc]
 
     @property
     def n(self) -> int:
         """Dimension of the state."""
         return len(self.Q)
+
+    @property
+    def noises(self) -> list[FloatArray]:
+        """Q (n, n) before the first of ``noise_slots`` and after each."""
+        return [piece["Q"] for piece in matrices_of_pieces({"Q": self.Q}, self.schedule)]
+
+    @property
+    def noise_slots(self) -> list[int]:
+        """The slots from which on Q is the next one."""
+        return [round(t / self.period) for t in self.schedule_times.tolist()]
 
     def inputs(self, slots: int) -> FloatArray:
         """Return u (S, m) of the slots 0 to S - 1."""
@@ -146,6 +170,7 @@ class MapPath(WithoutFrames):
         self, plant: NonlinearPlant, start: FloatArray, random: np.random.Generator
     ) -> None:
         self._plant, self._noise = plant, Blocks(random, plant.noise_root.shape[1])
+        self._roots, self._changes = [noise_root(Q) for Q in plant.noises], plant.noise_slots
         self._slot, self._x, self._u = 0, start, plant.inputs(BLOCK)
 
     def state(self, slot: int) -> FloatArray:
@@ -157,7 +182,8 @@ class MapPath(WithoutFrames):
             for k in range(self._slot, slot):
                 if k == len(self._u):
                     self._u = plant.inputs(2 * k)
-                noise = apply(plant.noise_root, self._noise.draw())
+                root = self._roots[bisect.bisect_right(self._changes, k)]
+                noise = apply(root, self._noise.draw())
                 self._x = f(self._x, self._u[k], k * plant.period, plant.period) + noise
         self._slot = slot
         return self._x

@@ -138,6 +138,11 @@ class Plant(Component, OnGrid):
     @property
     def changes(self) -> FloatArray:
         """(C,) times in seconds, increasing, at which the matrices of the plant change."""
+        return self.schedule_times
+
+    @property
+    def schedule_times(self) -> FloatArray:
+        """(C,) times in seconds, increasing, of ``schedule``; none of plants without one."""
         starts = [change.start for change in getattr(self, "schedule", ())]
         return self.time_grid.snap(np.array(starts, dtype=np.float64))
 

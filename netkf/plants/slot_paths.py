@@ -15,10 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.functions import call_function
 from netkf.linalg.lanes import Lanes, load, spread, store
+from netkf.linalg.small import count_until
 from netkf.rng.numbers import NormalZiggurat, next_normal
 
 
@@ -162,11 +163,13 @@ def draw_paths(
 
 
 class MapPaths(NamedTuple):
-    """``x[k+1] = f(x[k], u[k], t_k) + root z[k]`` in R runs, z standard normal: root (n, q).
+    """``x[k+1] = f(x[k], u[k], t_k) + S z[k]`` in R runs, z standard normal.
 
     f            address of the map (``linalg.functions``)
     u            (S, m) the input of all slots
     period       seconds of a slot
+    roots        (P, n, q) roots S, of which the next one holds from each of the slots ``changes``
+                 (P - 1,) on
     x            (B, n, L) state of the next slot
     given, moved (n,) scratch
     """
@@ -174,7 +177,8 @@ class MapPaths(NamedTuple):
     f: int
     u: FloatArray
     period: float
-    root: FloatArray
+    roots: FloatArray
+    changes: IntArray
     x: FloatArray
     given: FloatArray
     moved: FloatArray
@@ -193,11 +197,12 @@ def draw_map_paths(
     """Write the states of R runs in S slots from number ``slot`` on into ``out`` (B, S, n, L); move
     ``path`` behind these slots. ``states`` (R, WIDTH), ``scratch`` (q, L).
     """
-    n, columns = path.x.shape[1], path.root.shape[1]
+    n, columns = path.x.shape[1], path.roots.shape[2]
     for b in range(out.shape[0]):
         first = b * len(lanes)
         runs = min(len(lanes), len(states) - first)
         for s in range(out.shape[1]):
+            piece = count_until(path.changes, slot + s)
             draw_normals(lanes, states, first, 1, runs, ziggurat, scratch, columns)
             t, u = (slot + s) * path.period, path.u[slot + s]
             for i in range(n):
@@ -209,7 +214,7 @@ def draw_map_paths(
                 for i in range(n):
                     total = path.moved[i]
                     for j in range(columns):
-                        total += path.root[i, j] * scratch[j, q]
+                        total += path.roots[piece, i, j] * scratch[j, q]
                     path.x[b, i, q] = total
 
 

@@ -140,7 +140,7 @@ class DerivedScenario(ScenarioModel):
         model, plant = self.filter.model, self.plant
         pieces: Any = plant.pieces[: 1 + len(self.followed_changes)]
         if not plant.linear:
-            return ((np.full((plant.n, plant.n), math.nan), self._believed_Q),)
+            return ((np.full((plant.n, plant.n), math.nan), self.believed_noises[1][0]),)
         if isinstance(plant, LinearPlant):
             return tuple(
                 (p.F if model.F is None else model.F, p.Q if model.Q is None else model.Q)
@@ -324,18 +324,21 @@ class DerivedScenario(ScenarioModel):
         if not isinstance(plant, NonlinearPlant):
             F, Q = (_part(M, view) for M in self.believed_pieces[0])
             return SlotModel(F, Q, H, R, plant.period)
-        (f, jacobian), inputs, F, Q = self._curved(plant, view)
+        (f, jacobian), inputs, F, noises = self._curved(plant, view)
         u = self.believed_inputs[:, inputs]
+        slots = [round(t / plant.period) for t in self.believed_noises[0].tolist()]
         return MapModel(
-            F, Q, H, R, plant.period, f=f, jacobian=jacobian, u=u, linearise=self.filter.linearise
-        )
+            F, noises[0], H, R, plant.period, f=f, jacobian=jacobian, u=u, noises=noises,
+            noise_slots=slots, linearise=self.filter.linearise,
+        )  # fmt: skip
 
     def _curved(self, plant: Any, view: Any) -> tuple[Any, ...]:
-        """Return f, its Jacobian, the numbers of its inputs, nan, and Q of a ``view``."""
-        F, Q = (_part(M, view) for M in self.believed_pieces[0])
+        """Return f, its Jacobian, the numbers of its inputs, nan, and each Q of a ``view``."""
+        F = _part(self.believed_pieces[0][0], view)
+        noises = [_part(Q, view) for Q in self.believed_noises[1]]
         if isinstance(view, slice):
-            return plant.functions, np.arange(plant.m), F, Q
-        return (*plant.functions_of(view), F, Q)
+            return plant.functions, np.arange(plant.m), F, noises
+        return (*plant.functions_of(view), F, noises)
 
     @cached_property
     def believed_inputs(self) -> FloatArray:
@@ -814,25 +817,35 @@ class DerivedScenario(ScenarioModel):
             pairs.append((matrices[1], piece.Q))
             if self.plant.linear:
                 pairs.append((matrices[0], piece.F if self.slotted else piece.A))
+        if isinstance(self.plant, NonlinearPlant | NonlinearDiffusion):
+            times, believed_noises = self.believed_noises
+            if len(times) < int((self.plant.schedule_times < self.horizon).sum()):
+                return False
+            pairs += zip(believed_noises, self.plant.noises, strict=False)
         pairs += [
             (self.noise_covariance(k, believed=True), self.noise_covariance(k, believed=False))
             for k in range(len(self.sensors))
         ]
         return all(np.array_equal(believed, true) for believed, true in pairs)
 
-    @property
-    def _believed_Q(self) -> FloatArray:
-        """The covariance (n, n) of the noise of a nonlinear plant that filters believe."""
+    @cached_property
+    def believed_noises(self) -> tuple[FloatArray, list[FloatArray]]:
+        """Times (C,) in seconds, below the horizon, at which the noise of a nonlinear plant changes
+        as filters believe, and its covariance (n, n) at first and after each.
+        """
         plant, model = self.plant, self.filter.model
         assert isinstance(plant, NonlinearPlant | NonlinearDiffusion)
-        if isinstance(plant, NonlinearPlant):
-            return plant.Q if model.Q is None else model.Q
-        return plant.Q if model.B is None else np.asarray(model.B @ model.B.T)
+        given = model.Q if isinstance(plant, NonlinearPlant) else model.B
+        if given is not None:
+            return np.zeros(0), [given if self.slotted else np.asarray(given @ given.T)]
+        times = plant.schedule_times
+        times = times[times < self.horizon] if model.schedule else times[:0]
+        return times, plant.noises[: 1 + len(times)]
 
     def _flow_model(self, H: FloatArray, R: FloatArray, view: Any = slice(None)) -> FlowModel:
         plant = self.plant
         if isinstance(plant, NonlinearDiffusion):
-            (f, jacobian), inputs, A, Q = self._curved(plant, view)
+            (f, jacobian), inputs, A, noises = self._curved(plant, view)
             times, values, sine = plant.tables_of_input
             if not isinstance(view, slice) and len(times):
                 # Predictions begin anew where inputs of its own blocks change.
@@ -842,7 +855,8 @@ class DerivedScenario(ScenarioModel):
             known = 1.0 if self.filter.model.input else 0.0
             amplitudes = np.array([[known], [1.0], [1.0]])
             return RateModel(
-                A, Q, H, R, self.horizon, self.horizon, f=f, jacobian=jacobian, step=plant.step,
+                A, noises[0], H, R, self.horizon, self.horizon, f=f, jacobian=jacobian,
+                step=plant.step, noises=noises, noise_times=self.believed_noises[0],
                 tables_of_input=(times, known * values[:, inputs], sine[:, inputs] * amplitudes),
                 linearise=self.filter.linearise,
             )  # fmt: skip

@@ -6,6 +6,7 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError, errors_under
 from netkf.linalg.arrays import FloatArray
+from netkf.plants.curves import NonlinearDiffusion
 from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.regressors import RegressorSensor
 from netkf.scenario.derived import DerivedScenario
@@ -30,6 +31,9 @@ def check_schedule(scenario: DerivedScenario, why: str) -> None:
     for k, change in enumerate(getattr(plant, "schedule", ())):
         for name, value in change.matrices.items():
             key, width = f"plant.schedule[{k}].{name}", None if name == "B" else n
+            if isinstance(plant, NonlinearDiffusion):
+                # Noise is drawn step by step, of one number of components.
+                width = plant.B.shape[1]
             if name == "G":
                 if plant.input is None:
                     rule = "belongs to a plant with an input"
@@ -38,7 +42,7 @@ def check_schedule(scenario: DerivedScenario, why: str) -> None:
             require_shape(key, value, (n, width), why)
         if not scenario.slotted:
             continue
-        period, start = scenario.slot_plant.period, float(plant.changes[k])
+        period, start = scenario.slot_plant.period, float(plant.schedule_times[k])
         if scenario.slot_plant.slot_time(round(start / period)) != start:
             rule = f"must be a multiple of plant.period = {period:.15g}, where a slot begins"
             remedy = f"give {period * round(start / period):.15g}"

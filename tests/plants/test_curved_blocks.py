@@ -195,6 +195,8 @@ def test_what_others_read_of_a_pose_helps(scenario, kind):
 def test_blocks_in_continuous_time_are_integrated_side_by_side(scenario):
     """Two unicycles are two scenarios of one, with steps and jumps of both inputs."""
     plants = poses(step=0.02, B=(0.1 * np.eye(3)).tolist())
+    plants[0]["schedule"] = [{"from": 0.7, "B": (0.4 * np.eye(3)).tolist()}]
+    plants[1]["schedule"] = [{"from": t, "B": np.diag([t, 0.0, 0.1]).tolist()} for t in (0.3, 0.9)]
     plants[1]["input"] = {"kind": "sine", "amplitude": [0.8, 0.5], "frequency": 0.3, "phase": 0.5}
     changes = {
         "plants": plants,

@@ -165,7 +165,9 @@ def test_a_linear_f_is_the_diffusion(folder, method):
     sensor = {"nodes": [0], "H": [[1.0, 0.0]], "R": [[0.1]], "path": "z.csv", "kind": "recorded"}
     lines = [f"{0.17 * k!r},0,{math.sin(k)!r}" for k in range(1, 11)]
     (folder / "z.csv").write_text("t,node,y0\n" + "\n".join(lines) + "\n")
-    plant = {"B": noise, "mean": [0.1, 0.2], "cov": np.eye(2).tolist()}
+    # The noise changes between two steps.
+    schedule = [{"from": 0.633, "B": [[0.2], [0.1]]}, {"from": 1.4, "B": [[0.0], [1.5]]}]
+    plant = {"B": noise, "mean": [0.1, 0.2], "cov": np.eye(2).tolist(), "schedule": schedule}
     linear = {"kind": "diffusion", "A": Linear.A.tolist(), **plant}
     curved = {"kind": "nonlinear", "f": Linear(), "step": 0.01, **plant}
     network = {
@@ -285,6 +287,29 @@ def test_noise_inside_steps_has_its_law(folder):
     np.testing.assert_allclose(covariance, np.eye(len(times)), atol=0.11)
 
 
+class Still:
+    def f(self, x, u, t):
+        return np.zeros(1)
+
+    def jacobian(self, x, u, t):
+        return np.zeros((1, 1))
+
+
+def test_noise_that_changes_has_the_law_of_each_piece():
+    """The change is inside a step, a sample before it and one after it."""
+    schedule = [{"from": 0.35, "B": [[3.0]]}]
+    plant = NonlinearDiffusion(f=Still(), B=[[1.0]], step=0.1, schedule=schedule)
+    times, drawn = np.array([0.33, 0.38, 0.8]), np.zeros((2000, 3))
+    for run in range(len(drawn)):
+        streams = Streams(run, 0)
+        plain, *inside = (streams.generator(name) for name in ("plant", "samples", "probe"))
+        path = plant.curve(plain, (times, inside[0]), (np.empty(0), inside[1]))
+        drawn[run] = [path.absolute(t)[0] for t in times.tolist()]
+    variances = np.array([0.33, 0.02 + 9.0 * 0.03, 9.0 * 0.42])
+    increments = np.diff(drawn, axis=1, prepend=0.0) / np.sqrt(variances)
+    np.testing.assert_allclose(increments.T @ increments / 2000, np.eye(3), atol=0.16)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -292,6 +317,10 @@ def test_noise_inside_steps_has_its_law(folder):
         ({"plant.B": [[0.1, 0.0]]}, "plant.B: must have 3 rows, for x, y and heading"),
         ({"plant.A": [[1.0]]}, "plant.A: is not a key here"),
         ({"plant.Q": [[1.0]]}, "plant.Q: is not a key here"),
+        (
+            {"plant.schedule": [{"from": 1.0, "B": [[1.0], [0.0], [0.0]]}]},
+            "plant.schedule[0].B: must be 3 x 3, not 3 x 1",
+        ),
         (
             {"sensors": [{"nodes": [0], "H": [[1.0, 0.0, 0.0]], "R": [[1.0]]}]},
             "sensors[0].sampling: must be a clock, since increments of a nonlinear state",
@@ -375,6 +404,12 @@ COMPILED = {
     },
     "kernels and sensors of users": {
         "plant": SWING, "network": LATE, "sensors": [DISTANCE], "custom": (CUBES,),
+    },
+    "noise that changes": {
+        "sensors": [DISTANCE], "network": LATE,
+        "plant": table()["plant"] | {
+            "schedule": [{"from": 0.613, "B": np.diag([0.3, 0.2, 0.5]).tolist()}],
+        },
     },
     "one filter of all nodes": {"sensors": [DIRECTION, DISTANCE], "filter": {"kind": "central"}},
 }  # fmt: skip

@@ -383,10 +383,15 @@ LINEAR = {
 @pytest.mark.one_in(2)
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_linear_f_is_the_linear_plant(custom, engine):
-    """To the bit with the extended Kalman filter, else to rounding; both engines call Python."""
+    """To the bit with the extended Kalman filter, else to rounding; both engines call Python. The
+    noise changes twice.
+    """
     swing = netkf.load(custom)
-    linear = netkf.simulate(swing.replace(LINEAR), engine=engine)
-    nonlinear = {**LINEAR["plant"], "kind": "nonlinear", "f": "swings:Linear"}
+    noises = [[[0.01, 0.005], [0.005, 0.04]], [[0.0, 0.0], [0.0, 1e-3]]]
+    schedule = [{"from": 0.5 * k + 0.5, "Q": Q} for k, Q in enumerate(noises)]
+    plant = {**LINEAR["plant"], "schedule": schedule}
+    linear = netkf.simulate(swing.replace({"plant": plant}), engine=engine)
+    nonlinear = {**plant, "kind": "nonlinear", "f": "swings:Linear"}
     del nonlinear["F"]
     scenario = swing.replace({"plant": nonlinear})
     for method, tolerance in (("ekf", 0.0), ("ukf", 1e-13), ("ckf", 1e-13)):
@@ -394,6 +399,14 @@ def test_a_linear_f_is_the_linear_plant(custom, engine):
         np.testing.assert_array_equal(run.x, linear.x)
         np.testing.assert_allclose(run.xhat, linear.xhat, rtol=0.0, atol=tolerance)
         np.testing.assert_allclose(run.P, linear.P, rtol=0.0, atol=tolerance)
+    # Filters that do not know it believe the first noise.
+    del nonlinear["schedule"]
+    unaware = netkf.simulate(scenario.replace({"filter.model.schedule": False}), engine=engine)
+    steady = netkf.simulate(scenario.replace({"plant": nonlinear}), engine=engine)
+    np.testing.assert_array_equal(unaware.x, linear.x)
+    np.testing.assert_array_equal(unaware.P, steady.P)
+    assert not scenario.replace({"filter.model.schedule": False}).filters_know_the_truth
+    assert scenario.filters_know_the_truth
 
 
 def test_a_users_f_moves_the_first_block(custom):
@@ -457,6 +470,9 @@ def test_modules_need_trust_and_travel_with_the_run(custom):
         ({"plant.input": {"kind": "constant", "value": 1.0, "G": [[1.0], [0.0]]}}, "plant.input.G"),
         ({"plant.Q": [[1.0, 2.0], [2.0, 1.0]]}, "plant.Q: must be positive semidefinite"),
         ({"plant.mean": [1.0]}, "plant.mean: must be 2, not 1"),
+        ({"plant.schedule": [{"from": 0.5, "Q": [[1.0]]}]}, "schedule[0].Q: must be 2 x 2, not"),
+        ({"plant.schedule": [{"from": 0.5, "F": [[1.0]]}]}, "schedule[0].F: is not a key here"),
+        ({"plant.schedule": [{"from": 0.55, "Q": np.eye(2).tolist()}]}, "schedule[0].from: must"),
         ({"filter.linearise": "iekf"}, 'filter.linearise: must be one of "ekf", "ukf", "ckf"'),
         ({"filter.model": {"F": [[1.0, 0.0], [0.0, 1.0]]}}, "filter.model.F: means nothing"),
         (

@@ -25,10 +25,11 @@ from netkf.algorithms.kernels.run import (
     update_in_slot,
 )
 from netkf.algorithms.kernels.square_root import reflect, triangularise
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.functions import call_function
 from netkf.linalg.lanes import Lanes, load, spread, store
+from netkf.linalg.small import count_until
 from netkf.linalg.structs import Size, Struct
 
 METHODS = ("ekf", "ukf", "ckf")
@@ -64,13 +65,14 @@ class MapTables(Struct):
 
     f, jacobian : addresses (``linalg.functions``) of the map and its Jacobian
     u : (S, m), the input of slots 0 to S - 1
-    root_Q : (n, n), the lower triangular root of Q
+    roots : (P, n, n), lower triangular roots of Q, of which the next one holds from each of the
+            slots ``changes`` (P - 1,) on
     period, delay : seconds of a slot, and 1 where slots begin with the prediction from the one
         before, else 0
     active : runs side by side that there are, at most L
     distance, weight, center : ``Spread``
     x, moved, J, J_lanes, points, work : scratch, (n,), (n,), (n, n), (n, n, L), (2 n + 1, n) and
-        (n, 3 n + 1); root_Q and J_lanes are larger where a node's record has room for more states
+        (n, 3 n + 1); roots and J_lanes are larger where a node's record has room for more states
         than it estimates
     """
 
@@ -83,7 +85,8 @@ class MapTables(Struct):
     weight: float
     center: float
     u: FloatArray
-    root_Q: FloatArray
+    roots: FloatArray
+    changes: IntArray
     x: FloatArray
     moved: FloatArray
     J: FloatArray
@@ -126,7 +129,7 @@ def move_estimate(
     """Predict estimate ``k`` from number ``slot`` to the next; ``scratch`` are two arrays
     (n, n, L).
     """
-    slot = min(slot, len(model.u) - 1)
+    slot, root_Q = min(slot, len(model.u) - 1), model.roots[count_until(model.changes, slot)]
     if model.distance > 0.0:
         for q in range(model.active):
             _move_points(model, x, root, k, q, slot)
@@ -150,7 +153,7 @@ def move_estimate(
                 total += load(lanes, model.J_lanes, i, m) * load(lanes, root, k, m, j)
             store(lanes, moved, i, j, total)
         for j in range(i + 1):
-            store(lanes, noise, i, j, model.root_Q[i, j])
+            store(lanes, noise, i, j, root_Q[i, j])
     triangularise(lanes, size, root[k], moved, noise)
 
 
@@ -159,6 +162,7 @@ def _move_points(
     model: MapTables, x: FloatArray, root: FloatArray, k: int, q: int, slot: int
 ) -> None:
     n, points, work = len(model.x), model.points, model.work
+    root_Q = model.roots[count_until(model.changes, slot)]
     for r in range(2 * n + 1):
         set_point(x, root, k, q, model.distance, r, model.x)
         call_function(
@@ -169,7 +173,7 @@ def _move_points(
     weigh_points(points, model.weight, model.center, x[k], q, work)
     for i in range(n):
         for j in range(n):
-            work[i, 2 * n + 1 + j] = model.root_Q[i, j]
+            work[i, 2 * n + 1 + j] = root_Q[i, j]
     write_root(work, root[k], q)
 
 

@@ -1,7 +1,7 @@
 """Prediction in continuous time of a state that need not be linear, dx = f(x, u(t), t) dt + dw.
 
 The mean m, its transition Phi and the covariance W that noise adds are integrated by the classical
-Runge-Kutta method in steps of at most ``step``, which end where the input jumps::
+Runge-Kutta method in steps of at most ``step``, which end where the input or Q jumps::
 
     m' = f(m, u, t),    Phi' = J Phi,    W' = J W + W J' + Q,    J the Jacobian of f at m.
 
@@ -30,6 +30,7 @@ from netkf.algorithms.kernels.run import (
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.functions import call_function
+from netkf.linalg.small import count_until
 from netkf.linalg.structs import Struct
 
 DIFFERENCE = 1e-5
@@ -46,7 +47,8 @@ class RateTables(Struct):
     distance, weight, center : ``maps.Spread``
     times, values : (J,) and (J, m), the input is ``values[j]`` from ``times[j]`` on, 0 before
     sine : (3, m), amplitudes, rad/s and radians of the components that are sines, nan of others
-    Q : (n, n), the covariance of w over a second
+    Q : (P, n, n), covariances of w over a second, of which the next one holds from each of the
+        ``changes`` (P - 1,) on, in seconds, and the number ``piece`` of the present one
     u, slope, J, state, stage, rates, points, work, mean, root : scratch, (m,), (n,), (n, n),
         (n + 2 n n,) twice, (4, n + 2 n n), (2 n + 1, n), (n, 3 n + 1), (1, n, 1) and (1, n, n, 1);
         estimates may have room for more states than these n
@@ -62,6 +64,8 @@ class RateTables(Struct):
     values: FloatArray
     sine: FloatArray
     Q: FloatArray
+    changes: FloatArray
+    piece: int
     u: FloatArray
     slope: FloatArray
     J: FloatArray
@@ -81,22 +85,9 @@ class RateRun(Struct):
 
 
 @kernel
-def change_before(times: FloatArray, time: float) -> int:
-    """Return the index of the last of increasing ``times`` (J,) not after ``time``, -1 without."""
-    low, high = 0, len(times)
-    while low < high:
-        middle = (low + high) // 2
-        if times[middle] <= time:
-            low = middle + 1
-        else:
-            high = middle
-    return low - 1
-
-
-@kernel
 def set_input(model: RateTables, time: float, middle: float) -> None:
     """Write the input at ``time`` into ``model.u``; it does not jump from there to ``middle``."""
-    last = change_before(model.times, middle)
+    last = count_until(model.times, middle) - 1
     for k in range(len(model.u)):
         model.u[k] = model.values[last, k] if last >= 0 else 0.0
         if not math.isnan(model.sine[0, k]):
@@ -120,7 +111,7 @@ def _rate_of(
     J, second = model.J, n + n * n
     for i in range(n):
         for j in range(n):
-            moved, driven = 0.0, model.Q[i, j]
+            moved, driven = 0.0, model.Q[model.piece, i, j]
             for m in range(n):
                 moved += J[i, m] * state[n + m * n + j]
                 driven += J[i, m] * state[second + m * n + j] + J[j, m] * state[second + i * n + m]
@@ -151,10 +142,13 @@ def move_by_rate(
     """
     time, n = end - gap, len(model.slope)
     while time < end:
-        stop, later = end, change_before(model.times, time) + 1
+        stop, later = end, count_until(model.times, time)
         if later < len(model.times) and model.times[later] < stop:
             stop = model.times[later]
-        # Steps of equal length up to a jump of the input.
+        model.piece = count_until(model.changes, time)
+        if model.piece < len(model.changes) and model.changes[model.piece] < stop:
+            stop = model.changes[model.piece]
+        # Steps of equal length up to a jump of the input or of Q.
         count = max(1, math.ceil((stop - time) / model.step - 1e-9))
         length = (stop - time) / count
         for m in range(count):

@@ -60,7 +60,7 @@ from netkf.engines.compiled.slot_steps import StepTimes, absent, step_times
 from netkf.engines.compiled.slot_tables import COLUMNS, SlotTables
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import LANES, MANY, aligned, blocks_of, by_run, in_lanes, unset
-from netkf.linalg.portable import cholesky, solve_lower
+from netkf.linalg.portable import cholesky, noise_root, solve_lower
 from netkf.network.deliveries import Deliveries
 from netkf.plants.faults import FaultyReadings
 from netkf.plants.maps import NonlinearPlant
@@ -176,21 +176,19 @@ class SlotRuns:
         self._plant_states = self._streams.states("plant", [()])
         x, origin = (aligned((self._blocks, setup.n, LANES)) for _ in range(2))
         # C-contiguous copies, whatever the plant gives: kernels are compiled for one memory layout.
-        mean, root, noise = (
-            np.array(part, order="C")
-            for part in (plant.start_mean, plant.start_root, plant.noise_root)
-        )
+        mean, root = (np.array(part, order="C") for part in (plant.start_mean, plant.start_root))
         scratch = np.zeros((setup.n, LANES))
         draw_starts(MANY, self._plant_states, normal_ziggurat(), mean, root, scratch, x)
         if isinstance(plant, NonlinearPlant):
             self._map = plant.functions[0]
             self._path = MapPaths(
-                self._map.address, plant.inputs(setup.slots + 1), plant.period, noise, x,
-                np.zeros(setup.n), np.zeros(setup.n),
+                self._map.address, plant.inputs(setup.slots + 1), plant.period,
+                np.stack([noise_root(Q) for Q in plant.noises]),
+                np.array(plant.noise_slots, dtype=np.int64), x, *np.zeros((2, setup.n)),
             )  # fmt: skip
             return
         F = np.array(self._scenario.linear_plant.F, order="C")
-        self._path = Path(F, noise, setup.frame, x, origin)
+        self._path = Path(F, np.array(plant.noise_root, order="C"), setup.frame, x, origin)
         self._changes = {
             slot: (np.array(piece.F, order="C"), np.array(piece.noise_root, order="C"))
             for slot, piece in zip(plant.change_slots, plant.pieces[1:], strict=True)
@@ -530,7 +528,7 @@ class SlotRuns:
             rebased = np.array([slot > 0 and slot % setup.frame == 0 for slot in slots])
         if isinstance(self._path, MapPaths):
             local = unset((self._blocks, count, setup.n, LANES))
-            scratch = aligned((self._path.root.shape[1], LANES))
+            scratch = aligned((self._path.roots.shape[2], LANES))
             first, states = self._slot, self._plant_states
             draw_map_paths(MANY, self._path, states, normal_ziggurat(), first, scratch, local)
             self._map.raise_error()
