@@ -111,15 +111,15 @@ def use_row(f: PathScratch, d: int) -> None:
 
 
 @kernel
-def believe(record: Any, h: int, run: Any, but: int, q: int) -> float:
-    """Write the belief of node ``h`` of its path, from all evidence but that of link ``but``, into
-    the scratch; return the trace of the covariance of the present state.
+def believe(record: Any, h: int, n: int, links: tuple[int, int], but: int, q: int) -> float:
+    """Write what node ``h`` (n states) believes of its path into the scratch, from the evidence of
+    its ``links``, the first one and the one after the last, but not that of link ``but``; return
+    the trace of the covariance of the present state.
     """
-    f, n = record.work, len(run.size)
-    K = record.count[h, q]
+    f, K = record.work, record.count[h, q]
     d, total = (K + 1) * n, 0.0
     load_path(record, h, d, q)
-    for w in range(run.first[h], run.first[h + 1]):
+    for w in range(links[0], links[1]):
         for r in range(record.rows[w, q] if w != but else 0):
             f.y[0, 0, 0] = record.evidence_z[w, r, q]
             for j in range(d):
@@ -149,10 +149,9 @@ def keep_mean(f: PathScratch) -> None:
 
 
 @kernel
-def write_present(record: Any, h: int, run: Any, q: int) -> None:
+def write_present(record: Any, h: int, n: int, q: int) -> None:
     """Make the present state of the belief the estimate of node ``h``."""
-    f, n = record.work, len(run.size)
-    first = record.count[h, q] * n
+    f, first = record.work, record.count[h, q] * n
     for i in range(n):
         record.xhat[h, i, q] = f.x[0, first + i, 0]
         for j in range(first + n):
@@ -196,16 +195,16 @@ def eliminate(E: FloatArray, count: int, rows: int, columns: int) -> int:
 
 
 @kernel
-def mark(record: Any, h: int, run: Any, now: float, q: int) -> None:
+def mark(record: Any, h: int, n: int, links: tuple[int, int], now: float, q: int) -> None:
     """Make the present an instant of the window of node ``h``, without the oldest one if that is
     full.
     """
-    n, K = len(run.size), record.count[h, q]
+    K = record.count[h, q]
     if K > 0 and record.times[h, K - 1, q] == now:
         return
     is_full = record.times.shape[1] == K
     if is_full:
-        forget_oldest(record, h, run, q)
+        forget_oldest(record, h, n, links, q)
         K -= 1
     # The present stands there twice.
     first = K * n
@@ -224,14 +223,14 @@ def mark(record: Any, h: int, run: Any, now: float, q: int) -> None:
     record.total[h, q] = kept
     if is_full:
         # What was told of the oldest says less now.
-        believe(record, h, run, -1, q)
-        write_present(record, h, run, q)
+        believe(record, h, n, links, -1, q)
+        write_present(record, h, n, q)
 
 
 @kernel
-def forget_oldest(record: Any, h: int, run: Any, q: int) -> None:
+def forget_oldest(record: Any, h: int, n: int, links: tuple[int, int], q: int) -> None:
     """Leave the oldest instant out of the window of node ``h``, and of what senders told of it."""
-    f, n, K = record.work, len(run.size), record.count[h, q]
+    f, K = record.work, record.count[h, q]
     load_path(record, h, (K + 1) * n, q)
     leave_out_oldest(f, n, K * n)
     for i in range(K * n):
@@ -241,7 +240,7 @@ def forget_oldest(record: Any, h: int, run: Any, q: int) -> None:
     for k in range(K - 1):
         record.times[h, k, q] = record.times[h, k + 1, q]
     record.count[h, q] = K - 1
-    for w in range(run.first[h], run.first[h + 1]):
+    for w in range(links[0], links[1]):
         rows = load_evidence(record, w, f.evidence, q)
         # What the evidence says whatever the oldest state is.
         spent = eliminate(f.evidence, n, len(f.former), rows)
@@ -428,11 +427,14 @@ def place_of(times: FloatArray, i: int, count: int, time: float, q: int) -> int:
 
 
 @kernel
-def gather_pairs(record: Any, h: int, run: Any, w: int, m: int, mine: bool, M: int, q: int) -> int:
-    """Write the readings of the pair of link ``w`` that node ``h`` has kept (``mine``), or the
-    sender of message ``m`` tells, behind the first ``M`` rows of the scratch; return their number.
+def gather_pairs(
+    record: Any, h: int, n: int, pairs: Pairs, of: tuple[int, int], mine: bool, M: int, q: int
+) -> int:
+    """Write the readings of a pair that node ``h`` has kept (``mine``), or the sender tells, behind
+    the first ``M`` rows of the scratch; return their number. ``of`` are the number of the link and
+    of the message.
     """
-    f, p, tables = record.work, record.payload, record.tables
+    (w, m), f, p, tables = of, record.work, record.payload, record.tables
     for e in range(record.total[h, q] if mine else p.total[m, q]):
         b = record.block[h, e, q] if mine else p.block[m, e, q]
         since = record.since[h, e, q] if mine else p.since[m, e, q]
@@ -441,14 +443,14 @@ def gather_pairs(record: Any, h: int, run: Any, w: int, m: int, mine: bool, M: i
         j = place_of(p.times, m, p.count[m, q], since, q)
         if min(first, k, j) < 0:
             continue
-        at = len(run.size) * k, record.J.shape[3] * j, first, tables.size[b]
+        at = n * k, record.J.shape[3] * j, first, tables.size[b]
         write_believed(f, p, m, mine, at, q)
         if mine:
-            count = linearise_kept(f, run.pairs, record, h, e, q)
+            count = linearise_kept(f, pairs, record, h, e, q)
         else:
-            count = linearise_kept(f, run.pairs, p, m, e, q)
+            count = linearise_kept(f, pairs, p, m, e, q)
         for a in range(count):
-            write_row(f, a, mine, len(run.size), at, M)
+            write_row(f, a, mine, n, at, M)
             M += 1
     return M
 
@@ -496,14 +498,14 @@ def write_row(
 
 
 @kernel
-def find_evidence(record: Any, h: int, run: Any, w: int, m: int, q: int) -> int:
-    """Write what message ``m`` of link ``w`` says of the window of node ``h`` into the scratch, as
-    readings with unit noise: all readings of the pair at instants that both remember. Return their
-    number.
+def find_evidence(record: Any, h: int, n: int, pairs: Pairs, of: tuple[int, int], q: int) -> int:
+    """Write what a message says of the window of node ``h`` into the scratch, as readings with unit
+    noise: all readings of the pair at instants that both remember. Return their number. ``of`` are
+    the numbers of link and message.
     """
-    f, p, n, v = record.work, record.payload, len(run.size), record.J.shape[3]
-    M = gather_pairs(record, h, run, w, m, True, 0, q)
-    M = gather_pairs(record, h, run, w, m, False, M, q)
+    m, f, p, v = of[1], record.work, record.payload, record.J.shape[3]
+    M = gather_pairs(record, h, n, pairs, of, True, 0, q)
+    M = gather_pairs(record, h, n, pairs, of, False, M, q)
     d, e = record.count[h, q] * n, p.count[m, q] * v
     # The root of the covariance of G_other x_other + noise, without the squares: near each other
     # nodes have large derivatives.
@@ -611,7 +613,7 @@ def update(record: Any, h: int, run: Any) -> None:
                 for j in range(i + 1):
                     record.path_root[h, i, j, q] = f.S[0, i, j, 0]
         if len(run.pairs.row) > 0 and keep_pairs(record, h, run, q):
-            mark(record, h, run, time_of(run), q)
+            mark(record, h, n, (run.first[h], run.first[h + 1]), time_of(run), q)
 
 
 @kernel
@@ -619,29 +621,31 @@ def emit(record: Any, h: int, m: int, run: Any) -> None:
     """Send what node ``h`` believes of its path, to each neighbour without what it knows from that
     one. In slots the present becomes part of it: others may have read the block.
     """
-    first, stop = run.first[h], run.first[h + 1]
+    n, links, now = len(run.size), (run.first[h], run.first[h + 1]), time_of(run)
     for q in range(len(run.lanes)):
         if run.sends[q] == 0:
             continue
-        believe(record, h, run, -1, q)
+        believe(record, h, n, links, -1, q)
         keep_mean(record.work)
         if run.receiver != ALL:
-            believe(record, h, run, run.receiver, q)
-            write_message(record, h, m, run, q)
+            believe(record, h, n, links, run.receiver, q)
+            write_message(record, h, m, n, now, q)
         else:
-            for w in range(first, stop):
-                believe(record, h, run, w, q)
-                write_message(record, h, m + w - first, run, q)
-            believe(record, h, run, -1, q)
-            write_message(record, h, m + stop - first, run, q)
+            for k in range(links[1] - links[0] + 1):
+                # The last message is for nodes that it does not hear.
+                w = links[0] + k
+                believe(record, h, n, links, w if w < links[1] else -1, q)
+                write_message(record, h, m + k, n, now, q)
         if run.slot >= 0:
-            mark(record, h, run, time_of(run), q)
+            mark(record, h, n, links, now, q)
 
 
 @kernel
-def write_message(record: Any, h: int, m: int, run: Any, q: int) -> None:
-    """Write the belief in the scratch at the instants of the window and now into payload ``m``."""
-    f, p, n, now, K = record.work, record.payload, len(run.size), time_of(run), record.count[h, q]
+def write_message(record: Any, h: int, m: int, n: int, now: float, q: int) -> None:
+    """Write the belief in the scratch at the instants of the window and ``now`` into payload
+    ``m``.
+    """
+    f, p, K = record.work, record.payload, record.count[h, q]
     # The present is the last instant; the oldest is left out if there are too many.
     count = K if K > 0 and record.times[h, K - 1, q] == now else K + 1
     skipped = 1 if count > record.times.shape[1] else 0
@@ -667,20 +671,20 @@ def absorb(record: Any, h: int, run: Any) -> None:
     """Replace the evidence of each sender by that of its message, unless the one that node ``h``
     has was sent later.
     """
-    f, p = record.work, record.payload
+    f, p, n, links = record.work, record.payload, len(run.size), (run.first[h], run.first[h + 1])
     for q in range(len(run.lanes)):
         if not is_told(record, h, run, q):
             continue
-        trace, is_current = believe(record, h, run, -1, q), True
+        trace, is_current = believe(record, h, n, links, -1, q), True
         keep_mean(f)
         for k in range(run.count):
             m, w = run.message[k], run.link[k]
             if run.arrived[k, q] == 0 or p.sent[m, q] < record.sent[w, q]:
                 continue
-            rows, d = find_evidence(record, h, run, w, m, q), record.count[h, q] * len(run.size)
+            rows, d = find_evidence(record, h, n, run.pairs, (w, m), q), record.count[h, q] * n
             former = load_evidence(record, w, f.former, q)
             store_evidence(record, w, f.evidence, rows, d, q)
-            after = believe(record, h, run, -1, q)
+            after = believe(record, h, n, links, -1, q)
             # What was kept of an older message may say more, if windows are short.
             is_current = after <= (1.0 + ROUNDING) * trace
             if is_current:
@@ -689,8 +693,8 @@ def absorb(record: Any, h: int, run: Any) -> None:
             else:
                 store_evidence(record, w, f.former, former, d, q)
         if not is_current:
-            believe(record, h, run, -1, q)
-        write_present(record, h, run, q)
+            believe(record, h, n, links, -1, q)
+        write_present(record, h, n, q)
 
 
 @kernel
@@ -698,14 +702,14 @@ def is_told(record: Any, h: int, run: Any, q: int) -> bool:
     """Return True if messages have arrived; if one has a reading of node ``h`` of this instant, it
     becomes one of the window.
     """
-    found, p, now = False, record.payload, time_of(run)
+    found, p, now, links = False, record.payload, time_of(run), (run.first[h], run.first[h + 1])
     for k in range(run.count):
         m = run.message[k]
         if run.arrived[k, q] == 1:
             found = True
             for e in range(p.total[m, q]):
                 if p.since[m, e, q] == now and record.tables.first[h, p.block[m, e, q]] >= 0:
-                    mark(record, h, run, now, q)
+                    mark(record, h, len(run.size), links, now, q)
     return found
 
 
