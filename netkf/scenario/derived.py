@@ -475,10 +475,11 @@ class DerivedScenario(ScenarioModel):
         stacks = [self._stack_entries(entries, believed=False) for entries in counts]
         informations = [np.asarray(H.T @ np.linalg.solve(R, H)) for H, R in stacks]
         weighted = (k * G for k, G in zip(counts.values(), informations, strict=True))
-        total_information = sum(weighted, 0.0 * plant.A)
+        # A sum of information does not always take the shortest intervals.
+        updates = [sum(weighted, 0.0 * plant.A), *informations]
         period = min(
             default_sensing_period(
-                piece, informations, longest_interval(piece.A, piece.Q, total_information)
+                piece, informations, min(longest_interval(piece.A, piece.Q, G) for G in updates)
             )
             for piece in plant.pieces
         )

@@ -90,6 +90,22 @@ def test_models_hold_the_sensors_of_increments_only(make):
     assert make([]).diffusion.sensing_period is not None
 
 
+def test_the_default_sensing_period_suits_each_node_and_not_only_all_together(make):
+    """Of these two nodes the first needs shorter intervals than both together."""
+    plant = {
+        "A": [[0.8272, -0.2011, 0.0006462], [-0.2869, -0.6773, 0.004165], [-465.4, -63.02, -0.557]],
+        "B": [[0.1524, 0.007792, 0.07837], [-0.6522, -0.4336, 0.3393], [-28.14, -2.822, 32.74]],
+        "cov": np.eye(3).tolist(),
+    }
+    sensors = [
+        {"nodes": [0], "H": [[6.978, -3.57, 0.0159]], "R": [[1.866]]},
+        {"nodes": [1], "H": [[-0.5824, -1.487, -0.02464]], "R": [[0.5413]]},
+    ]
+    together = make(sensors, plant)
+    alone = min(make([one], plant).diffusion.sensing_period for one in sensors)
+    assert together.diffusion.sensing_period <= alone
+
+
 def test_streams_of_samples_have_their_names(make):
     scenario, streams = make([SAMPLED, {**SAMPLED, "nodes": [1]}]), Streams(4)
     times = scenario.sample_times(streams)

@@ -1,5 +1,7 @@
 """H(12) and its steady state against closed forms and plain integrations."""
 
+import re
+
 import numpy as np
 import pytest
 import scipy.integrate
@@ -315,6 +317,37 @@ def test_threshold_where_a_node_sees_through_derivatives(build, A, critical):
     with pytest.raises(netkf.TheoryError, match="is below the threshold") as caught:
         theory.steady_covariance_bound(scenario)
     assert float(str(caught.value).split()[-1]) == pytest.approx(critical, rel=1e-4)
+
+
+@pytest.mark.parametrize("units", [(1e3, 1.0, 1e-3), (1e-3, 16.0, 1e-3)])
+def test_a_steady_state_does_not_depend_on_the_units_of_states(build, units):
+    """A damped chain of three integrators in kilometres, metres and millimetres, and others."""
+    A, B = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -0.1]], [[0.0], [0.0], [1.0]]
+
+    def scenario(u, rate=3.0, a=0.0):
+        return build(
+            plant={
+                "kind": "diffusion",
+                "A": ((A + a * np.eye(3)) * np.outer(u, 1.0 / u)).tolist(),
+                "B": (B * u[:, None]).tolist(),
+                "cov": np.diag(u * u).tolist(),
+            },
+            sensors=[{"nodes": [0], "H": [[1.0 / u[0], 0.0, 0.0]], "R": [[1.0]]}],
+            network={
+                "graph": {"kind": "path", "nodes": 2},
+                "activation": {"kind": "poisson", "rate": rate},
+            },
+            filter={"kind": "hybrid", "epsilon": 0.5},
+        )
+
+    one, u = np.ones(3), np.array(units)
+    expected = theory.steady_covariance_bound(scenario(one)) * np.outer(u, u)
+    found = theory.steady_covariance_bound(scenario(u))
+    np.testing.assert_allclose(found, expected, rtol=1e-7)
+    with pytest.raises(netkf.TheoryError, match="is below the threshold") as caught:
+        theory.steady_covariance_bound(scenario(u, 0.5, 0.3))
+    with pytest.raises(netkf.TheoryError, match=re.escape(str(caught.value))):
+        theory.steady_covariance_bound(scenario(one, 0.5, 0.3))
 
 
 def test_two_decoupled_axes_have_the_threshold_of_one(build):

@@ -45,6 +45,7 @@ from netkf.theory.hybrid.samples import (
 
 EQUAL_RATES = 1e-8  # difference of rates that count as equal, as a share of the largest rate
 RESIDUAL_TOLERANCE = 1e-9  # of the left null vector, relative
+BALANCING_SWEEPS = 200  # at most, of natural units
 
 
 class CoupledRiccati(NamedTuple):
@@ -77,6 +78,14 @@ class CoupledRiccati(NamedTuple):
         sent = any(jump.weights is not None and jump.weights.any() for jump in self.jumps)
         return bool(self.coupling.nnz or any(s.heard.nnz for s in self.samples) or sent)
 
+    @property
+    def information(self) -> FloatArray:
+        """The information (n, n) of all increments per second and of one sample of each sensor."""
+        total = self.G.sum(axis=0)
+        for group in self.samples:
+            total += np.einsum("kpi,kpj->ij", group.H, np.linalg.solve(group.R, group.H))
+        return np.asarray(total)
+
     def restrict(self, node: int) -> CoupledRiccati:
         """Return the equation of the node with index ``node`` without the others, with N = 1."""
         return self._replace(
@@ -91,9 +100,43 @@ class CoupledRiccati(NamedTuple):
             ),
         )
 
+    def in_natural_units(self) -> tuple[CoupledRiccati, FloatArray]:
+        """Return the equations of states in natural units, and these (n,); without jumps."""
+        units = natural_units(self.A, self.Q, self.information)
+        covariance, drift = np.outer(units, units), np.outer(1.0 / units, units)
+        scaled = self._replace(
+            A=self.A * drift,
+            Q=self.Q / covariance,
+            G=self.G * covariance,
+            T=self.T * drift,
+            q=self.q / covariance,
+            start=self.start / covariance,
+            samples=tuple(group._replace(H=group.H * units) for group in self.samples),
+        )
+        return scaled, units
+
     def scale_rates(self, factor: float) -> CoupledRiccati:
         """Return the equations with all link rates multiplied by ``factor``."""
         return self._replace(coupling=factor * self.coupling)
+
+
+def natural_units(A: FloatArray, Q: FloatArray, G: FloatArray) -> FloatArray:
+    """Return powers of 2 (n,): units of states in which a Riccati equation with A, Q and G (n, n)
+    is balanced, so that what is large or small in it does not depend on the units of the plant.
+    """
+    A, Q, G = (np.abs(matrix) for matrix in (A - np.diag(np.diagonal(A)), Q, G))
+    units = np.ones(len(A))
+    for _ in range(BALANCING_SWEEPS):
+        before = units.copy()
+        for i, unit in enumerate(units):
+            # Rates of what the state does, and of what is done to it.
+            acts = unit * (A[:, i] / units + G[i] * units).sum()
+            suffers = (A[i] * units + Q[i] / units).sum() / unit
+            if acts > 0.0 and suffers > 0.0:
+                units[i] = unit * (suffers / acts) ** 0.25
+        if np.abs(np.log2(units / before)).max() < 0.1:
+            break
+    return np.asarray(np.ldexp(1.0, np.round(np.log2(units)).astype(int)))
 
 
 def concerns_hybrid_paper(scenario: Scenario) -> bool:

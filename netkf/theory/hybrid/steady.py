@@ -80,7 +80,8 @@ def has_stabilising_gains(scenario: Scenario) -> bool:
     """Return True if some gains stabilise H(12), in half the time of :func:`has_steady_state`,
     which also finds plants with a mode that is neither driven nor damped. Raises TheoryError.
     """
-    return _stabilising_covariances(PackedRiccati(coupled_riccati(scenario)), None) is not None
+    equations, _ = coupled_riccati(scenario).in_natural_units()
+    return _stabilising_covariances(PackedRiccati(equations), None) is not None
 
 
 def steady_by_node(scenario: Scenario) -> FloatArray:
@@ -95,8 +96,10 @@ def steady_by_node(scenario: Scenario) -> FloatArray:
 
 def steady_state(equations: CoupledRiccati, first: FloatArray | None = None) -> FloatArray | None:
     """Return the steady state (N, n, n) of H(12), or None; TheoryError for a cycle."""
+    equations, units = equations.in_natural_units()
+    unit = np.outer(units, units)
     packed = PackedRiccati(equations)
-    P = _stabilising_covariances(packed, first)
+    P = _stabilising_covariances(packed, None if first is None else first / unit)
     if P is None:
         return None
     # Newton's method converges monotonically from stabilising gains, quadratically in the end,
@@ -119,7 +122,7 @@ def steady_state(equations: CoupledRiccati, first: FloatArray | None = None) -> 
             f"the steady state of Tanwani's H(12) was solved to {residual:.1e} only: "
             "some mode is neither driven by noise nor damped"
         )
-    return P
+    return P * unit
 
 
 def _stabilising_covariances(packed: PackedRiccati, first: FloatArray | None) -> FloatArray | None:
@@ -145,11 +148,8 @@ def _newton(packed: PackedRiccati, P: FloatArray) -> FloatArray:
 def _find_stabilising(packed: PackedRiccati, first: FloatArray | None = None) -> FloatArray | None:
     """Return covariances (N, n, n) whose gains stabilise H(12), by implicit steps, or None."""
     equations, n = packed.equations, len(packed.equations.A)
-    information = equations.G.sum(axis=0)
-    for group in equations.samples:
-        information += np.einsum("kpi,kpj->ij", group.H, np.linalg.solve(group.R, group.H))
     # A mode that is hidden and neither grows nor decays ends in steps so long that it looks damped.
-    if undetectable_mode(equations.A, information) is not None:
+    if undetectable_mode(equations.A, equations.information) is not None:
         return None
     size = max(float(np.abs(x).max()) for x in (equations.Q, equations.start, [[1e-12]]))
     # The multiple of I makes P positive definite where start and Q are singular.
@@ -215,6 +215,7 @@ def _no_steady_state(scenario: Scenario, equations: CoupledRiccati) -> str:
 
 def threshold_factor(equations: CoupledRiccati) -> float | None:
     """Return the least factor on link rates with a steady state of H(12); None above 1e6."""
+    equations, _ = equations.in_natural_units()
 
     def stabilised(factor: float, first: FloatArray | None) -> FloatArray | None:
         return _find_stabilising(PackedRiccati(equations.scale_rates(factor)), first)

@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 
 from netkf.core.errors import TheoryError
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, is_definite
 from netkf.linalg.spectra import contracts, growth_factor
 from netkf.scenario.scenario import Scenario
 from netkf.theory.numerics.matrices import as_integer
@@ -98,7 +98,7 @@ def _require_conditions(scenario: Scenario, law: Averaging, P: FloatArray) -> No
         raise TheoryError('P Theorems 5 and 6 need links = "fresh", a draw for each step')
     if not np.array_equal(law.hears.min(axis=1), law.both):
         raise TheoryError("P Theorems 5 and 6 need failures of both directions together")
-    if not np.linalg.eigvalsh(P)[0] > 1e-14 * np.abs(P).max():
+    if not is_definite(P):
         raise TheoryError("P_inf is singular, so the norms of P (35) do not exist")
 
 
