@@ -162,9 +162,6 @@ def require_errors(scenario: Scenario) -> None:
     if scenario.has_mistimed_increments:
         rule = "exact errors with wrong clocks are known of sensors that sample"
         raise TheoryError(f"{rule}, not of those that give increments; {CONSISTENCY}")
-    if scenario.has_mistimed_models:
-        rule = "exact errors with wrong clocks are known without inputs and changes of the plant"
-        raise TheoryError(f"{rule}; {CONSISTENCY}")
     if scenario.links_follow_state and scenario.node_filter.timing.talks:
         raise TheoryError("the true state says who hears whom: events tell of it")
 

@@ -15,6 +15,7 @@ from netkf.core.instants import TimeGrid
 from netkf.network.clocks import Periodic, Poisson
 from netkf.network.node_clocks import NodeTime, node_time
 from netkf.rng.streams import Streams
+from netkf.theory.errors import error_law
 from netkf.trace.schema import CODES
 
 # Without noise estimates are a linear map of x(0), which a plain recursion gives to rounding.
@@ -202,8 +203,9 @@ def test_what_filters_know_of_the_plant_is_of_local_times(scenario_of, delay, ke
     np.testing.assert_allclose(run.P, P, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(run.xhat, xhat, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(run.error, run.x[:, None] - xhat, rtol=1e-9, atol=1e-9)
-    with pytest.raises(netkf.TheoryError, match="without inputs and changes"):
-        netkf.theory.error_covariance(scenario, run)
+    law = error_law(scenario, run)
+    np.testing.assert_allclose(law.mean.reshape(run.error.shape), run.error, atol=1e-9)
+    np.testing.assert_allclose(law.P, P, rtol=1e-9, atol=1e-12)
 
 
 CURVED = """import numpy as np
@@ -629,6 +631,28 @@ def test_exact_errors_are_those_of_the_joint_moments(scenario_of, engine):
     np.testing.assert_allclose(exact, plain_covariances(run, 0.13), rtol=1e-9, atol=1e-11)
     # What P misses.
     assert (exact[-1].trace(axis1=1, axis2=2) > 1.02 * run.P[-1].trace(axis1=1, axis2=2)).any()
+
+
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize(("kind", "at"), FILTERS)
+def test_mean_errors_are_those_of_a_run_without_noise(scenario_of, kind, at, tmp_path):
+    """Of filters that know an input and, but for push-sum, changes, with stamps from the future and
+    nodes that begin again.
+    """
+    (tmp_path / "u.csv").write_text("t,u0\n" + "".join(f"{t},{u}\n" for t, u in JUMPS))
+    changes = {key: DRIVEN[key] for key in DRIVEN if kind != "push-sum" or "input" in key}
+    if kind != "push-sum":
+        lives = {"kind": "duty", "nodes": [1], "period": 2.5, "up": 2.0}
+        memory = "kept" if kind == "intermittent" else "lost"
+        changes["network.lives"] = [lives | {"memory": memory}]
+    clock = {"kind": "readings"} if at == "readings" else {"kind": "poisson", "rate": 2.0, "at": at}
+    kept = {"mean": [0.5, 0.0], "cov": PRIOR.tolist(), "model": {"B": [[0.2, 0.0], [0.0, 1.0]]}}
+    changes |= {"filter": {"kind": kind, **MORE.get(kind, {}), **kept}, "network.activation": clock}
+    scenario = scenario_of(delay=0.05).replace(changes | {"filter.model.R": [[0.3]]})
+    run = netkf.simulate(scenario, seed=1)
+    law = error_law(scenario, run)
+    np.testing.assert_allclose(law.mean.reshape(run.error.shape), run.error, atol=1e-9)
+    np.testing.assert_allclose(law.P, run.P, rtol=1e-9, atol=1e-12)
 
 
 def test_exact_errors_of_filters_in_python_are_not_known(scenario_of):

@@ -7,6 +7,7 @@ of these (``forms``). A filter needs no rule of its own for that.
 
 from __future__ import annotations
 
+import bisect
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple, cast
@@ -77,6 +78,12 @@ class ClockColumns(LoggedColumns):
         self._times = [self._clock_reading(h, 0.0) for h in range(self.estimators)]
         super().__init__()
         self._now = 0.0
+        responses = scenario.input_responses
+        # Estimates are counted from the response that the clock of their node shows.
+        self._response = responses.believed if responses is not None and self._clocks else None
+        for h, shown in enumerate(self._times if self._response is not None else ()):
+            if shown != 0.0:
+                self._filters.restart(h, scenario.prior_shift(scenario.nodes[h], shown))
         self._free = list(range(self._filters.messages))[::-1]
         self._uses: Counter[int] = Counter()
         self._source: int | None = None
@@ -95,6 +102,7 @@ class ClockColumns(LoggedColumns):
         movable = movable and not (self._forgetful or self._clocks or scenario.views)
         self._checked, self._unit = 0.0, 1.0 / rate if movable else np.inf
         self._changes = plant.changes[plant.changes < scenario.horizon].tolist()
+        self._followed = scenario.followed_changes.tolist()
         self._begin_piece(0)
         clock = cast(Any, scenario.network.activation)
         broadcasts = clock is not None and clock.at in ("nodes", "readings")
@@ -165,8 +173,9 @@ class ClockColumns(LoggedColumns):
         elif kind in (CRASH, LEAVE, RESTART, JOIN) and node in self._scenario.waking_nodes:
             self._change_life(node, time)
         if kind in (RESTART, JOIN) and node in self._forgetful:
-            self._times[self._index[node]] = self._clock_reading(self._index[node], time)
-            self._filters.restart(self._index[node], self._scenario.prior_shift(node, time))
+            h = self._index[node]
+            shown = self._times[h] = self._clock_reading(h, time)
+            self._filters.restart(h, self._scenario.prior_shift(node, shown))
 
     def _move_truth(self, time: float) -> None:
         """Move the true state to ``time``, with an input for each noise of the plant."""
@@ -218,6 +227,10 @@ class ClockColumns(LoggedColumns):
         self._move_increments(time)
         shown = self._clock_reading(h, time)
         self._filters.run.now = shown
+        if self._clocks:
+            # Its model changes when its clock shows the time of a change.
+            piece = bisect.bisect_right(self._followed, shown)
+            self._filters.clocked.begin_piece(piece)
         gap, self._times[h] = shown - self._times[h], shown
         return gap
 
@@ -226,11 +239,35 @@ class ClockColumns(LoggedColumns):
         clock = self._clocks.get(self._scenario.nodes[h])
         return time if clock is None else clock.shows(time)
 
-    def _stamped_age(self, h: int, message: Sent, time: float) -> float:
-        """Return the age that the stamp of a message tells node h at ``time``."""
+    def _ahead(self, h: int, time: float) -> FloatArray:
+        """Return by how much the origin of the estimates of node h is ahead of that of the truth at
+        ``time``, (n,).
+        """
+        assert self._response is not None
+        shown, true = self._response.states(np.array([self._clock_reading(h, time), time]))
+        return np.asarray(shown - true)
+
+    def _stamped_age(self, h: int, message: Sent, time: float) -> tuple[float, FloatArray | None]:
+        """Return the age that the stamp of a message tells node h at ``time``, and by how much what
+        it tells moves, (n,), if it is taken for one of another time than that of its stamp.
+        """
         instant, shown = self._scenario.time_grid.instant, self._clock_reading(h, time)
-        told = instant(shown - self._clock_reading(message.sender, message.time))
-        return min(max(told, 0.0), instant(shown - self._clock_reading(h, 0.0)))
+        stamp = self._clock_reading(message.sender, message.time)
+        age = min(max(instant(shown - stamp), 0.0), instant(shown - self._clock_reading(h, 0.0)))
+        taken_for = instant(shown - age)
+        if self._response is None or taken_for == stamp:
+            return age, None
+        origin, other = self._response.states(np.array([stamp, taken_for]))
+        return age, np.asarray(origin - other)
+
+    def _move_message(self, message: Sent, moved: FloatArray) -> None:
+        """Let what a message tells be counted from an origin that has ``moved`` (n,) back."""
+        offset = np.zeros((self.n, self._forms_of_all.used))
+        offset[:, MEAN] = moved
+        self._filters.shift_message(message.payload, offset)
+        if message.reading is not None:
+            H, rows = message.reading
+            self._forms_of_all.table[rows, MEAN] += H @ moved
 
     def _sense(self, h: int, time: float) -> None:
         observation: Observation | None = self._samples.get(time, {}).pop(h, None)
@@ -244,6 +281,8 @@ class ClockColumns(LoggedColumns):
         H, noise = self._whiten(observation)
         y = H @ forms.table[self._x, : forms.used]
         y[:, first:] += noise
+        if self._response is not None:
+            y[:, MEAN] -= H @ self._ahead(h, time)
         if self._filters.kernels.sends_readings:
             _, _, old = self._read.pop(h, (0.0, H, self._x[:0]))
             forms.give(old)
@@ -301,9 +340,13 @@ class ClockColumns(LoggedColumns):
         inbox = all_heard
         if scenario.node_filter.timing.newest_only:
             inbox = list({message.sender: message for message in inbox}.values())
-        readings = []
+        readings, moved = [], list[tuple[Sent, FloatArray]]()
         for k, message in enumerate(inbox):
-            run.message[k], run.age[k] = message.payload, self._stamped_age(h, message, time)
+            run.message[k] = message.payload
+            run.age[k], offset = self._stamped_age(h, message, time)
+            if offset is not None:
+                self._move_message(message, offset)
+                moved.append((message, offset))
             run.link[k] = self._link[message.sender, h]
             run.message_weight[k] = run.weight[run.link[k]]
             run.heard[k] = -1
@@ -312,6 +355,9 @@ class ClockColumns(LoggedColumns):
                 run.heard[k] = len(readings)
         run.count = len(inbox)
         filters.absorb(h, gap, [message.payload for message in inbox], readings)
+        for message, offset in moved:
+            # Others take it for what it is to them.
+            self._move_message(message, -offset)
         for message in all_heard:
             self._release(message.payload)
             if message.reading is not None:
@@ -320,7 +366,11 @@ class ClockColumns(LoggedColumns):
     def _forms(self) -> FloatArray:
         table, used = self._forms_of_all.table, self._forms_of_all.used
         estimates = table[self._filters.xhat_rows.reshape(-1), :used]
-        return np.asarray(table[self._x[self._entries.ravel()], :used] - estimates)
+        errors = np.asarray(table[self._x[self._entries.ravel()], :used] - estimates)
+        if self._response is not None:
+            ahead = [self._ahead(h, self._now) for h in range(self.estimators)]
+            errors[:, MEAN] -= np.concatenate(ahead)
+        return errors
 
     def covariances(self) -> FloatArray:
         """Return P (M, n, n) of the estimators."""
