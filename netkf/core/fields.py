@@ -29,7 +29,7 @@ from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.instants import as_written
 from netkf.core.printable import MAX_NAME, MAX_RUNS
 from netkf.core.stamps import TimeBase
-from netkf.linalg.arrays import FloatArray, is_semidefinite, readonly_array
+from netkf.linalg.arrays import FloatArray, is_definite, is_semidefinite, readonly_array
 
 
 @dataclass(frozen=True)
@@ -520,10 +520,9 @@ def _convert_covariance(value: Any) -> FloatArray:
 
 def _convert_definite_covariance(value: Any) -> FloatArray:
     result = _convert_symmetric(value)
-    eigenvalues = np.linalg.eigvalsh(result)
-    smallest, largest = eigenvalues[0], eigenvalues[-1]
     # Its inverse must not consist of rounding errors, nor exceed MAX_MAGNITUDE.
-    if not smallest > max(1e-14 * abs(largest), 1.0 / MAX_MAGNITUDE):
+    if not (is_definite(result) and np.diagonal(result).min() > 1.0 / MAX_MAGNITUDE):
+        smallest = np.linalg.eigvalsh(result)[0]
         raise _SpecificError(f"must be positive definite (least eigenvalue {smallest:.3g})")
     return result
 

@@ -18,7 +18,7 @@ import numpy as np
 from netkf.core.csv_files import Columns, read_columns, read_header
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import MAX_MAGNITUDE, SourceFile
-from netkf.linalg.arrays import FloatArray, block_diagonal, readonly_array
+from netkf.linalg.arrays import FloatArray, block_diagonal, is_definite, readonly_array
 from netkf.linalg.portable import cholesky, solve_lower
 
 _NOISE_COLUMN = re.compile(r"R\d*")
@@ -165,9 +165,8 @@ class ReadingTable:
         sizes = np.abs(np.einsum("kii->ki", whole)).sum(axis=1) / present.sum(axis=1)
         k, i = np.nonzero(~present)
         whole[k, i, i] = sizes[k]
-        eigenvalues = np.linalg.eigvalsh(whole)
-        least, largest = eigenvalues[:, 0], np.abs(eigenvalues[:, -1])
-        wrong = np.flatnonzero(~(least > np.maximum(1e-14 * largest, 1.0 / MAX_MAGNITUDE)))
+        smallest = np.diagonal(whole, axis1=1, axis2=2).min(axis=1)
+        wrong = np.flatnonzero(~(is_definite(whole) & (smallest > 1.0 / MAX_MAGNITUDE)))
         if wrong.size:
             row = int(np.flatnonzero(checked)[wrong[0]])
             there = np.flatnonzero(self.present[row])

@@ -916,17 +916,20 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def start_margin(self) -> float:
-        """The least eigenvalue, in units of P, of P_i(0) less the second moment of its error."""
+        """The least eigenvalue of P_i(0) less the second moment of its error, where each state is
+        in units of the larger of both.
+        """
         plant, smallest = self.plant, np.inf
         starts = ((*self.initial_estimate(i), k) for k, i in enumerate(self.nodes))
         # Most networks have one start for all nodes.
         for mean, cov, k in {(id(start[0]), id(start[1])): start for start in starts}.values():
             view = self.model_view(k)
             offset = plant.start_mean[view] - mean
-            gap = cov - plant.start_cov[view][:, view] - np.outer(offset, offset)
-            smallest = min(
-                smallest, float(np.linalg.eigvalsh(gap)[0]) / max(1.0, np.abs(cov).max())
-            )
+            moment = plant.start_cov[view][:, view] + np.outer(offset, offset)
+            sizes = np.sqrt(np.maximum(np.diagonal(cov), np.diagonal(moment)))
+            units = np.where(sizes > 0.0, sizes, 1.0)
+            gap = (cov - moment) / np.outer(units, units)
+            smallest = min(smallest, float(np.linalg.eigvalsh(gap)[0]))
         return smallest
 
     def weight(self, receiver: int, sender: int) -> float:

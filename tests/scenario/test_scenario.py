@@ -212,3 +212,19 @@ def test_a_node_estimates_those_of_the_named_blocks_that_it_has(tmp_path):
     for names, rule in [(["bias"], "node 0 has none"), (["biass"], "name of one of")]:
         with pytest.raises(netkf.ScenarioError, match=rule):
             scenario.replace({"filter.estimates": names})
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_noises_of_rows_in_any_units_are_positive_definite(tmp_path, recorded):
+    """A range in metres beside a direction in radians, both of which are read well."""
+    R = [[2.4e7, 0.0128], [0.0128, 1.5e-9]]
+    scenario = netkf.load(SCENARIOS / "intermittent_scalar.toml")
+    sensor = {"nodes": [0], "H": [[1.0], [1e-8]], "R": R}
+    if recorded:
+        values = ",".join(str(R[i][j]) for i, j in ((0, 0), (0, 1), (1, 1)))
+        (tmp_path / "y.csv").write_text(f"t,node,y0,y1,R00,R01,R11\n1.0,0,2.0,3.0,{values}\n")
+        sensor |= {"kind": "recorded", "path": "y.csv"}
+    table = {**as_table(scenario), "sensors": [sensor]}
+    assert np.array_equal(from_table(table, tmp_path).sensors[0].R, R)
+    with pytest.raises(netkf.ScenarioError, match="must be positive definite"):
+        from_table({**table, "sensors": [{**sensor, "R": [[2.4e7, 0.2], [0.2, 1.5e-9]]}]}, tmp_path)

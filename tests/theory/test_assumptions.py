@@ -26,6 +26,21 @@ def test_clocks_are_named_by_what_has_them(build, at):
     assert rows[f"the {at[:-1]} clocks are independent Poisson processes"]
 
 
+@pytest.mark.parametrize("unit", [1.0, 1e-6, 1e6])
+@pytest.mark.parametrize("share", [0.25, 1.0, 2.0])
+def test_a_start_that_is_too_sure_is_so_in_any_unit(build, unit, share):
+    variance = unit * unit
+    plant = {"A": [[-0.1]], "B": [[unit]], "cov": [[variance]]}
+    sensor = {"nodes": [0], "H": [[1.0 / unit]], "R": [[1.0]]}
+    scenario = build(
+        plant={"kind": "diffusion", **plant},
+        sensors=[{**sensor, "sampling": {"kind": "poisson", "rate": 1.0}}],
+        filter={"kind": "hybrid", "epsilon": 0.5, "cov": [[share * variance]]},
+    )
+    row = "P_i(0) >= E[(x(0) - xhat_i(0))(x(0) - xhat_i(0))']"
+    assert holds(scenario)[row] is (share >= 1.0)
+
+
 def test_sampling_has_a_row(build):
     name = "sensors sample by Poisson clocks or at known times"
     for sampling, expected in (
