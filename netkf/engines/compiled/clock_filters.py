@@ -71,6 +71,7 @@ class ClockFilters:
         links = _links_by_receiver(scenario)
         starts = list(zip(start.xhat, start.root, strict=True))
         count, self._common = len(links["sender"]), common_table(scenario)
+        self._degree = int(np.diff(links["first"]).max(initial=0))
         self.records = make_records(
             scenario.node_filter,
             starts,
@@ -240,8 +241,11 @@ class ClockFilters:
         return {name: np.array([one[name] for one in sums]) for name in self._conserved}
 
     def _room(self, messages: int) -> int:
-        """Return for how many messages there must be room with those that are translated."""
-        return 2 * messages if len(self._common) else messages
+        """Return for how many messages there must be room with those that are translated, or that
+        a node tells all others at once.
+        """
+        told = self._degree + 1 if self.kernels.addressed else 0
+        return (2 * messages if len(self._common) else messages) + told
 
     def grow(self, messages: int) -> None:
         """Make room for so many messages; those that are there stay."""

@@ -14,7 +14,7 @@ import numpy as np
 from netkf.algorithms.kernels import run as standard
 from netkf.algorithms.kernels.gates import pass_gate, scale_rows
 from netkf.algorithms.kernels.rates import RateTables
-from netkf.algorithms.kernels.run import ClockRun, interval_end
+from netkf.algorithms.kernels.run import ALL, ClockRun, interval_end
 from netkf.algorithms.records import Kernels
 from netkf.core.instants import snapped
 from netkf.engines.base import LONGER, MIN_GAP_SHARE
@@ -73,7 +73,7 @@ from netkf.engines.compiled.nonlinear_samples import (
     set_pair,
 )
 from netkf.engines.compiled.outcomes import OUT_OF_RANGE
-from netkf.engines.compiled.quantiser import clear_payload, quantise_payload
+from netkf.engines.compiled.quantiser import clear_payloads, quantise_payloads
 from netkf.engines.compiled.state import AFTER_READINGS, NODES, Instants, Simulation
 from netkf.linalg.addresses import NOTHING, address_of, call_at, call_at_two, number_at
 from netkf.linalg.arrays import IntArray
@@ -377,14 +377,19 @@ def send_all(
     arrives = becomes == SOME_ARRIVE or verbs.counts_sends == 1 or verbs.decides == 1
     run.sends[0] = 1
     choose_model(state, run, verbs, h)
-    if arrives and verbs.addressed == 0:
-        clear_payload(state.quantiser, m)
-        call_at_two(verbs.emit, record, h, m, run)
+    few_bits, told, count = len(state.quantiser.fields) > 0, m, 1
+    if few_bits and verbs.addressed == 1:
+        # All its messages at once, behind those under way, as each takes dither.
+        told, count = len(run.message), run.first[h + 1] - run.first[h] + 1
+        run.receiver = ALL
+    if arrives and (few_bits or verbs.addressed == 0):
+        clear_payloads(state.quantiser, told, count)
+        call_at_two(verbs.emit, record, h, told, run)
     if run.sends[0] == 0:
         release(state, m)
         return
     if becomes != NONE_SENT:
-        state.clipped = quantise_payload(state.quantiser, h, m, 0)
+        state.clipped = quantise_payloads(state.quantiser, h, told, count, 0)
     if broadcast:
         record_event(state, now, TRANSMIT, state.nodes[h].id, -1, state.nodes[h].sent)
         state.nodes[h].sent += 1
@@ -400,11 +405,28 @@ def send_all(
                     call_at_two(verbs.copy, record, copy, m, run)
             used = True
             if verbs.addressed == 1:
-                run.receiver = run.opposite[state.incoming[w]]
-                call_at_two(verbs.emit, record, h, copy, run)
+                address_message(state, record, run, verbs, (h, w), copy, told)
             dispatch(state, w, copy, tag, delay, now)
     if not used:
         release(state, m)
+
+
+@kernel
+def address_message(
+    state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, of: tuple[int, int],
+    m: int, told: int,
+) -> None:  # fmt: skip
+    """Let node ``h`` write payload ``m`` for the receiver of directed link ``w``, ``of`` both, or
+    copy it from those that it has ``told``, if that is not the same place.
+    """
+    h, w = of
+    run.receiver = run.opposite[state.incoming[w]]
+    if len(state.quantiser.fields) == 0:
+        call_at_two(verbs.emit, record, h, m, run)
+        return
+    first, last = run.first[h], run.first[h + 1]
+    link = run.receiver if run.receiver >= 0 else last
+    call_at_two(verbs.copy, record, m, told + link - first, run)
 
 
 @kernel

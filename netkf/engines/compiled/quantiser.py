@@ -109,8 +109,6 @@ def unquantised_messages(scenario: Scenario) -> str | None:
         return None
     if scenario.input_responses is not None and scenario.input_responses.believed is not None:
         return "messages of few bits beside an input that filters know"
-    if kernels.addressed:
-        return "messages of few bits that differ from hearer to hearer"
     infos, models = scenario.node_infos, scenario.model_pieces[0]
     record = kernels.record_of(scenario.node_filter, infos, models)
     for name, given in record.payload.items():
@@ -121,12 +119,13 @@ def unquantised_messages(scenario: Scenario) -> str | None:
 
 
 @kernel
-def clear_payload(quantiser: Quantiser, m: int) -> None:
-    """Set the numbers of payload ``m`` to 0, of which ``emit`` may not write all: what an earlier
-    message told must not take part.
+def clear_payloads(quantiser: Quantiser, m: int, count: int) -> None:
+    """Set the numbers of ``count`` payloads from ``m`` on to 0, of which ``emit`` may not write
+    all: what an earlier message told must not take part.
     """
     for f in range(len(quantiser.fields)):
-        clear_field(struct_like(quantiser.field, quantiser.fields[f]), m)
+        for k in range(count):
+            clear_field(struct_like(quantiser.field, quantiser.fields[f]), m + k)
 
 
 @kernel
@@ -136,14 +135,15 @@ def clear_field(field: QuantisedField, m: int) -> None:
 
 
 @kernel
-def quantise_payload(quantiser: Quantiser, stream: int, m: int, q: int) -> int:
-    """Replace the numbers of payload ``m`` in lane ``q`` by those that are received, with dither of
-    a ``stream``; return how many were clipped.
+def quantise_payloads(quantiser: Quantiser, stream: int, m: int, count: int, q: int) -> int:
+    """Replace the numbers of ``count`` payloads from ``m`` on in lane ``q`` by those that are
+    received, with dither of a ``stream``; return how many were clipped.
     """
     clipped = 0
     for f in range(len(quantiser.fields)):
         field = struct_like(quantiser.field, quantiser.fields[f])
-        clipped += quantise_field(quantiser, field, stream, m, q)
+        for k in range(count):
+            clipped += quantise_field(quantiser, field, stream, m + k, q)
     return clipped
 
 

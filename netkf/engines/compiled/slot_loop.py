@@ -15,7 +15,7 @@ from netkf.algorithms.kernels.gates import pass_gate
 from netkf.algorithms.kernels.nonlinear_rows import linearise_rows
 from netkf.algorithms.kernels.run import SlotRun
 from netkf.algorithms.records import Kernels
-from netkf.engines.compiled.quantiser import Quantiser, clear_payload, quantise_payload
+from netkf.engines.compiled.quantiser import Quantiser, clear_payloads, quantise_payloads
 from netkf.linalg.addresses import NOTHING, AnyStruct, address_of, call_at, call_at_two, viewed_as
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
@@ -254,13 +254,16 @@ def exchange(
                 store(lanes, run.uniform, load(lanes, plan.uniform, b, s, e, h))
             run.reading = h
             use_model_of_run(run, plan, h)
-            m = h + run.first[h] if verbs.addressed == 1 else h
-            clear_payload(plan.quantiser, m)
+            m, count = h, 1
+            if verbs.addressed == 1:
+                # One for each of its links, and one more.
+                m, count = h + run.first[h], run.first[h + 1] - run.first[h] + 1
+            clear_payloads(plan.quantiser, m, count)
             call_at_two(verbs.emit, record, h, m, run)
             if decides:
                 store_flags(lanes, plan.sent, b, s, e, h, load_flags(lanes, run.sends))
             if plan.speaks.shape[0] > 0:
-                quantise_message(plan, b, s, e, h, nodes)
+                quantise_messages(plan, b, s, e, h, nodes, (m, count))
         if decides:
             drop_silent(run, plan, b, s, e)
     if e != plan.stop:
@@ -276,14 +279,19 @@ def exchange(
 
 
 @kernel
-def quantise_message(plan: SlotPlan, b: int, s: int, e: int, h: int, nodes: int) -> None:
-    """Quantise the message of node ``h`` in all lanes in which it is sent."""
+def quantise_messages(
+    plan: SlotPlan, b: int, s: int, e: int, h: int, nodes: int, sent: tuple[int, int]
+) -> None:
+    """Quantise what node ``h`` has ``sent``, the first payload and how many these are, in all lanes
+    in which it is sent.
+    """
     lanes = plan.speaks.shape[4]
     for q in range(lanes):
         silent = len(plan.sent) > 0 and plan.sent[b, s, e, h, q] == 0
         if plan.speaks[b, s, e, h, q] == 1 and not silent:
             stream = (b * lanes + q) * nodes + h
-            plan.clipped[b, s, e, h, q] = quantise_payload(plan.quantiser, stream, h, q)
+            clipped = quantise_payloads(plan.quantiser, stream, sent[0], sent[1], q)
+            plan.clipped[b, s, e, h, q] = clipped
 
 
 @kernel
