@@ -34,8 +34,8 @@ from netkf.core.fields import field, integer
 
 MAX_WINDOW = 1000
 """A message of more states could not be sent: a larger value is a mistake."""
-MAX_MEMORY = 2**27
-"""Numbers that all nodes may keep."""
+MAX_MEMORY = 2**25
+"""Numbers that all nodes may keep in a run, of which several may be side by side."""
 
 
 def note_loops(scenario: Any) -> tuple[str, ...]:

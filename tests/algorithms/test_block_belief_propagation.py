@@ -280,6 +280,13 @@ def test_robots_that_see_each_other_follow_plain_python(tmp_path: Path, law: str
         np.testing.assert_allclose(run.P, expected.P, atol=1e-10)
 
 
+def test_windows_that_do_not_fit_into_memory_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ScenarioError, match=r"filter\.window: is too long: .* got 1000; write a"):
+        robots("clocks", tmp_path).replace({"filter.window": 1000})
+    # No slot is remembered twice.
+    assert netkf.simulate(robots("slots", tmp_path).replace({"filter.window": 1000})).P.size
+
+
 def test_messages_that_have_readings_are_not_quantised(tmp_path: Path) -> None:
     few: dict[str, Any] = {"network__quantise": {"bits": 8, "range": 20.0}}
     with pytest.raises(ScenarioError, match=r"quantise: cannot be with .* have readings .* got 8"):
