@@ -48,7 +48,8 @@ nitpick_ignore_regex = [
     (
         r"py:class",
         r"ndarray|ArrayLike|FloatArray|IntArray|Edge|Entry|Link|SourceFile|Executor|Path"
-        r"|Progress|Coupling|StackedStates|Key|DiffusionChange|LinearChange|Course|Fault|Drawn|dict\[.*",
+        r"|Progress|Coupling|StackedStates|Key|(Diffusion|Linear|Map|Rate)Change|Course|Fault"
+        r"|Drawn|dict\[.*",
     ),
     # parts of the inside: states of filters, paths of sensors, base classes without public members
     (
