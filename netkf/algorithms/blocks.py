@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -34,12 +34,13 @@ def blocks_by_key(blocks: Sequence[Place], n: int) -> dict[Key, Place]:
     return {place.key: place for place in places}
 
 
-def block_numbers(infos: Sequence[Any]) -> dict[Key, int]:
+def block_numbers(infos: Sequence[Any]) -> Mapping[Key, int]:
     """Return a number for each block that is estimated, if the ``NodeInfo`` of nodes say so, else
     for those that these nodes or their senders estimate.
     """
     if infos[0].numbers:
-        return dict(infos[0].numbers)
+        given: Mapping[Key, int] = infos[0].numbers
+        return given
     seen = [places for info in infos for places in (info.blocks, *info.heard)]
     keys = [place.key for places in seen for place in places]
     return {key: number for number, key in enumerate(dict.fromkeys(keys))}

@@ -108,7 +108,7 @@ def _check_times(scenario: DerivedScenario) -> None:
 
 
 def _check_entries(scenario: DerivedScenario, samples: float) -> None:
-    nodes, n = len(scenario.nodes), scenario.plant.n
+    nodes, n = len(scenario.nodes), scenario.width
     if samples * nodes * n * n > MAX_ENTRIES:
         raise ScenarioError(
             "probe",

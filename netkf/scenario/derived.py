@@ -351,9 +351,7 @@ class DerivedScenario(ScenarioModel):
     @cached_property
     def node_infos(self) -> tuple[NodeInfo, ...]:
         """The facts about node and network that each filter is given, in the order of ``nodes``."""
-        total_information = np.zeros((self.plant.n, self.plant.n))
-        for information in self.informations:
-            total_information = total_information + information
+        total_information = self._total_information
         senders, receivers = self.topology.senders, self.topology.receivers
         max_delay = 0.0 if self.slotted else self.longest_delay
         degrees, own_weights, network = self.topology.degrees, self.own_weights, self._network_info
@@ -402,18 +400,20 @@ class DerivedScenario(ScenarioModel):
     @property
     def _most_pairs(self) -> tuple[int, int]:
         """The most readings of pairs that an instant has at any node, and the most rows of one."""
-        counts, rows, blocks = [1], [1], self.layout.places
+        counts, rows, places = [1], [1], self.layout.places
+        block = np.repeat(np.arange(len(places)), [place.n for place in places])
         for node, view in zip(self.nodes, self.views or (), strict=self.views is not None):
             counts.append(0)
             for placed in self.placed_sensors.get(node, ()):
-                others = np.setdiff1d(self.support(placed), view)
+                others, sensor = (
+                    np.setdiff1d(self.support(placed), view),
+                    self.sensors[placed.entry],
+                )
                 if others.size:
-                    sensor, found = self.sensors[placed.entry], set(others.tolist())
                     p = len(sensor.R)
                     # Rows of one reading may be about several blocks, each of which is a pair.
-                    about = sum(not found.isdisjoint(range(b.first, b.first + b.n)) for b in blocks)
-                    each = min(about, p) if sensor.record is None else 1
-                    counts[-1] += each * (self.most_rows(node, placed) // p)
+                    about = min(p, len(np.unique(block[others]))) if sensor.record is None else 1
+                    counts[-1] += about * (self.most_rows(node, placed) // p)
                     rows.append(p)
         return max(counts), max(rows)
 
@@ -432,6 +432,21 @@ class DerivedScenario(ScenarioModel):
     def informations(self) -> tuple[FloatArray, ...]:
         """Believed ``H' R^-1 H`` (n, n) of the sensors of each node, in the order of ``nodes``."""
         return _shared(lambda H, R: symmetric(H.T @ np.linalg.solve(R, H)), self._believed_stacks)
+
+    @property
+    def _total_information(self) -> FloatArray:
+        """The sum (n, n) of ``informations``."""
+        total = np.zeros((self.plant.n, self.plant.n))
+        if self.views is None:
+            for information in self.informations:
+                total = total + information
+            return total
+        # Those of all nodes at once would fill the memory: each has few of the states.
+        for H, R in self._believed_stacks:
+            own = np.flatnonzero(H.any(axis=0))
+            part = H[:, own]
+            total[np.ix_(own, own)] += symmetric(part.T @ np.linalg.solve(R, part))
+        return total
 
     @property
     def _believed_stacks(self) -> Iterator[tuple[FloatArray, FloatArray]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -239,3 +240,16 @@ def test_tables_of_sensors_have_the_rows_of_one_of_them_not_of_all_that_a_node_h
     assert setup.p == 12
     assert setup.sensors.H.shape == (1 + 12 * 11, 1, 12)
     assert setup.sensors.noise.shape == (1 + 12 * 11, 1, 1)
+
+
+def test_many_robots_are_few_states_each(tmp_path):
+    """600 were refused for covariances of all 600 states at each, and filled 2 GiB with them."""
+    text = ROBOTS.replace("nodes = [1, 2, 3]", f"nodes = {list(range(600))}")
+    text = text.replace("edges = [[1, 2], [2, 3]]", "nodes = 600").replace('"edges"', '"path"')
+    tracemalloc.start()
+    scenario = load(text, tmp_path)
+    infos, peak = scenario.node_infos, tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert (scenario.width, len(infos)) == (1, 600)
+    # Some matrices of all states, whatever the number of nodes.
+    assert peak < 200e6
