@@ -29,7 +29,7 @@ from netkf.algorithms.kernels.rates import (
 from netkf.algorithms.kernels.root_flow import FlowTable, flow_root, flow_table, gain_update_root
 from netkf.algorithms.kernels.run import CLOSE, usable
 from netkf.algorithms.kernels.square_root import lower_root
-from netkf.linalg.arrays import FloatArray, enlarged, square_root, symmetric
+from netkf.linalg.arrays import FloatArray, IntArray, enlarged, square_root, symmetric
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import ONE, aligned
 from netkf.linalg.vector_functions import VectorFunction
@@ -225,7 +225,7 @@ class MapModel(SlotModel):
     u: FloatArray
     linearise: str
     noises: Sequence[FloatArray]
-    noise_slots: Sequence[int]
+    noise_slots: IntArray
 
     slot: ClassVar[int] = 0
     """The slot from which ``predict`` begins; engines say it by ``move_to``, of a copy."""
@@ -253,7 +253,7 @@ class MapModel(SlotModel):
             center=center,
             u=np.array(self.u, order="C"),
             roots=np.stack([enlarged(first_root(Q), width, width) for Q in self.noises]),
-            changes=np.array(self.noise_slots, dtype=np.int64),
+            changes=np.array(self.noise_slots),
             x=np.zeros(n),
             moved=np.zeros(n),
             J=np.zeros((n, n)),

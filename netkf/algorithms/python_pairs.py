@@ -59,7 +59,7 @@ class PythonPairs:
 
     @cached_property
     def _known(self) -> NonlinearRows:
-        """What linearises readings that are kept."""
+        """The rows of all readings that are kept, which Python linearises."""
         p = int(self._info.most_pairs[1])
         rows = self._rows(1, p)
         rows.kind[0, 0] = IN_PYTHON

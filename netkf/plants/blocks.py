@@ -31,6 +31,7 @@ from netkf.core.fields import (
 from netkf.core.instants import TimeGrid
 from netkf.core.places import Place
 from netkf.linalg.arrays import FloatArray, block_diagonal
+from netkf.plants.changes import matrices_of_pieces
 from netkf.plants.curves import NonlinearDiffusion
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.dynamics import BlockPart, StackedDynamics
@@ -323,11 +324,9 @@ def _stack_nonlinear(blocks: Sequence[Block]) -> Plant:
 
 def _noise_at(plant: Any, name: str, time: float) -> FloatArray:
     """Return Q or B, by ``name``, of a plant at a ``time`` (seconds)."""
-    present: FloatArray = getattr(plant, name)
-    for change in plant.schedule:
-        if change.start <= time:
-            present = getattr(change, name)
-    return present
+    k = sum(change.start <= time for change in plant.schedule)
+    noise: FloatArray = matrices_of_pieces({name: getattr(plant, name)}, plant.schedule)[k][name]
+    return noise
 
 
 def _check_beside_nonlinear(k: int, block: Block) -> None:

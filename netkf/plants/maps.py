@@ -99,10 +99,16 @@ class NonlinearPlant(NonlinearStates, SlotPlant):
         """Q (n, n) before the first of ``noise_slots`` and after each."""
         return [piece["Q"] for piece in matrices_of_pieces({"Q": self.Q}, self.schedule)]
 
+    @cached_property
+    def noise_roots(self) -> list[FloatArray]:
+        """Roots (n, n) of ``noises``, by which standard normals are multiplied."""
+        return [noise_root(Q) for Q in self.noises]
+
     @property
     def noise_slots(self) -> list[int]:
         """The slots from which on Q is the next one."""
-        return [round(t / self.period) for t in self.schedule_times.tolist()]
+        slots: list[int] = self.slots_of(self.schedule_times).tolist()
+        return slots
 
     def inputs(self, slots: int) -> FloatArray:
         """Return u (S, m) of the slots 0 to S - 1."""
@@ -169,8 +175,8 @@ class MapPath(WithoutFrames):
     def __init__(
         self, plant: NonlinearPlant, start: FloatArray, random: np.random.Generator
     ) -> None:
-        self._plant, self._noise = plant, Blocks(random, plant.noise_root.shape[1])
-        self._roots, self._changes = [noise_root(Q) for Q in plant.noises], plant.noise_slots
+        self._plant, self._noise = plant, Blocks(random, plant.noise_roots[0].shape[1])
+        self._changes = plant.noise_slots
         self._slot, self._x, self._u = 0, start, plant.inputs(BLOCK)
 
     def state(self, slot: int) -> FloatArray:
@@ -182,7 +188,7 @@ class MapPath(WithoutFrames):
             for k in range(self._slot, slot):
                 if k == len(self._u):
                     self._u = plant.inputs(2 * k)
-                root = self._roots[bisect.bisect_right(self._changes, k)]
+                root = plant.noise_roots[bisect.bisect_right(self._changes, k)]
                 noise = apply(root, self._noise.draw())
                 self._x = f(self._x, self._u[k], k * plant.period, plant.period) + noise
         self._slot = slot

@@ -326,7 +326,7 @@ class DerivedScenario(ScenarioModel):
             return SlotModel(F, Q, H, R, plant.period)
         (f, jacobian), inputs, F, noises = self._curved(plant, view)
         u = self.believed_inputs[:, inputs]
-        slots = [round(t / plant.period) for t in self.believed_noises[0].tolist()]
+        slots = plant.slots_of(self.believed_noises[0])
         return MapModel(
             F, noises[0], H, R, plant.period, f=f, jacobian=jacobian, u=u, noises=noises,
             noise_slots=slots, linearise=self.filter.linearise,
@@ -405,11 +405,8 @@ class DerivedScenario(ScenarioModel):
         for node, view in zip(self.nodes, self.views or (), strict=self.views is not None):
             counts.append(0)
             for placed in self.placed_sensors.get(node, ()):
-                others, sensor = (
-                    np.setdiff1d(self.support(placed), view),
-                    self.sensors[placed.entry],
-                )
-                if others.size:
+                sensor = self.sensors[placed.entry]
+                if (others := np.setdiff1d(self.support(placed), view)).size:
                     p = len(sensor.R)
                     # Rows of one reading may be about several blocks, each of which is a pair.
                     about = min(p, len(np.unique(block[others]))) if sensor.record is None else 1

@@ -132,7 +132,7 @@ def move_estimate(
     slot, root_Q = min(slot, len(model.u) - 1), model.roots[count_until(model.changes, slot)]
     if model.distance > 0.0:
         for q in range(model.active):
-            _move_points(model, x, root, k, q, slot)
+            _move_points(model, x, root, k, q, slot, root_Q)
         return
     n, own, (moved, noise) = len(size), len(model.x), scratch
     for q in range(model.active):
@@ -159,10 +159,9 @@ def move_estimate(
 
 @kernel
 def _move_points(
-    model: MapTables, x: FloatArray, root: FloatArray, k: int, q: int, slot: int
+    model: MapTables, x: FloatArray, root: FloatArray, k: int, q: int, slot: int, root_Q: FloatArray
 ) -> None:
     n, points, work = len(model.x), model.points, model.work
-    root_Q = model.roots[count_until(model.changes, slot)]
     for r in range(2 * n + 1):
         set_point(x, root, k, q, model.distance, r, model.x)
         call_function(

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from netkf.algorithms.kernels.block_fusion import semidefinite_root
 from netkf.algorithms.kernels.estimates import transform_root, update_by_row
 from netkf.algorithms.kernels.nonlinear_rows import LINEAR
 from netkf.algorithms.kernels.pairs import Pairs, block_of_pair, linearise_at, write_origin
@@ -218,7 +219,7 @@ def mark(record: Any, h: int, n: int, links: tuple[int, int], now: float, q: int
     kept = 0
     for e in range(record.total[h, q]):
         if record.since[h, e, q] >= record.times[h, 0, q]:
-            copy_kept(record, h, kept, record, h, e, q)
+            copy_stored(record, h, kept, record, h, e, q)
             kept += 1
     record.total[h, q] = kept
     if is_full:
@@ -280,7 +281,7 @@ def store_evidence(record: Any, w: int, E: FloatArray, rows: int, known: int, q:
 
 
 @kernel
-def copy_kept(to: Any, i: int, e: int, source: Any, j: int, s: int, q: int) -> None:
+def copy_stored(to: Any, i: int, e: int, source: Any, j: int, s: int, q: int) -> None:
     """Copy reading number ``s`` of entry ``j`` of ``source`` to number ``e`` of entry ``i``."""
     to.since[i, e, q], to.length[i, e, q] = source.since[j, s, q], source.length[j, s, q]
     to.block[i, e, q], to.sensor[i, e, q] = source.block[j, s, q], source.sensor[j, s, q]
@@ -354,7 +355,7 @@ def keep_pair(record: Any, h: int, run: Any, c: int, q: int) -> None:
 
 
 @kernel
-def linearise_kept(f: PathScratch, pairs: Pairs, source: Any, i: int, e: int, q: int) -> int:
+def linearise_stored(f: PathScratch, pairs: Pairs, source: Any, i: int, e: int, q: int) -> int:
     """Write reading number ``e`` that entry ``i`` of ``source`` keeps, whitened, into ``value``,
     ``J`` and ``J_other``, at the estimates of its node and of the other block that stand in
     ``J[0]`` and ``J_other[0]``; return how many rows it has.
@@ -386,12 +387,12 @@ def linearise_kept(f: PathScratch, pairs: Pairs, source: Any, i: int, e: int, q:
             for j in range(v):
                 f.J[a, j] = known.J[a, j] if j < own else 0.0
                 f.J_other[a, j] = known.J[a, own + j] if own + j < width else 0.0
-    whiten_kept(f, count)
+    whiten_stored(f, count)
     return int(count)
 
 
 @kernel
-def whiten_kept(f: PathScratch, count: int) -> None:
+def whiten_stored(f: PathScratch, count: int) -> None:
     """Divide a reading by the Cholesky factor of ``C``; values that are missing say nothing."""
     C, v = f.C, f.J.shape[1]
     for a in range(count):
@@ -400,12 +401,8 @@ def whiten_kept(f: PathScratch, count: int) -> None:
             f.J[a, :] = f.J_other[a, :] = 0.0
             for b in range(count):
                 C[a, b] = C[b, a] = 1.0 if a == b else 0.0
+    semidefinite_root(C, count)
     for a in range(count):
-        for b in range(a + 1):
-            total = C[a, b]
-            for c in range(b):
-                total -= C[a, c] * C[b, c]
-            C[a, b] = math.sqrt(total) if a == b else total / C[b, b]
         for b in range(a):
             f.value[a] -= C[a, b] * f.value[b]
             for j in range(v):
@@ -418,7 +415,7 @@ def whiten_kept(f: PathScratch, count: int) -> None:
 
 
 @kernel
-def place_of(times: FloatArray, i: int, count: int, time: float, q: int) -> int:
+def index_of_time(times: FloatArray, i: int, count: int, time: float, q: int) -> int:
     """Return the place of a ``time`` among the first ``count`` ones of entry ``i``, or -1."""
     for k in range(count):
         if times[i, k, q] == time:
@@ -439,16 +436,16 @@ def gather_pairs(
         b = record.block[h, e, q] if mine else p.block[m, e, q]
         since = record.since[h, e, q] if mine else p.since[m, e, q]
         first = tables.theirs[w, b] if mine else tables.first[h, b]
-        k = place_of(record.times, h, record.count[h, q], since, q)
-        j = place_of(p.times, m, p.count[m, q], since, q)
+        k = index_of_time(record.times, h, record.count[h, q], since, q)
+        j = index_of_time(p.times, m, p.count[m, q], since, q)
         if min(first, k, j) < 0:
             continue
         at = n * k, record.J.shape[3] * j, first, tables.size[b]
         write_believed(f, p, m, mine, at, q)
         if mine:
-            count = linearise_kept(f, pairs, record, h, e, q)
+            count = linearise_stored(f, pairs, record, h, e, q)
         else:
-            count = linearise_kept(f, pairs, p, m, e, q)
+            count = linearise_stored(f, pairs, p, m, e, q)
         for a in range(count):
             write_row(f, a, mine, n, at, M)
             M += 1
@@ -539,11 +536,10 @@ def predict(record: Any, h: int, run: Any) -> None:
     linearised at the belief, the best estimate.
     """
     n, lanes = len(run.size), run.lanes
-    transition(run.model, run, record.xhat, h, run.noise)
+    transition(run.model, run, record.xhat, h, record.F)
     for i in range(n):
         store(lanes, record.moved, 0, i, load(lanes, record.xhat, h, i))
         for j in range(n):
-            store(lanes, record.F, i, j, load(lanes, run.noise, i, j))
             store(lanes, record.moved_root, 0, i, j, 0.0)
     predict_estimate(run.model, run, record.moved, record.moved_root, 0, h)
     for q in range(len(lanes)):
@@ -628,14 +624,15 @@ def emit(record: Any, h: int, m: int, run: Any) -> None:
         believe(record, h, n, links, -1, q)
         keep_mean(record.work)
         if run.receiver != ALL:
-            believe(record, h, n, links, run.receiver, q)
+            if run.receiver >= 0:
+                believe(record, h, n, links, run.receiver, q)
             write_message(record, h, m, n, now, q)
         else:
-            for k in range(links[1] - links[0] + 1):
-                # The last message is for nodes that it does not hear.
-                w = links[0] + k
-                believe(record, h, n, links, w if w < links[1] else -1, q)
-                write_message(record, h, m + k, n, now, q)
+            # Nodes that it does not hear are told everything.
+            write_message(record, h, m + links[1] - links[0], n, now, q)
+            for w in range(links[0], links[1]):
+                believe(record, h, n, links, w, q)
+                write_message(record, h, m + w - links[0], n, now, q)
         if run.slot >= 0:
             mark(record, h, n, links, now, q)
 
@@ -663,7 +660,7 @@ def write_message(record: Any, h: int, m: int, n: int, now: float, q: int) -> No
                 p.root[m, k, i, c // n, c % n, q] = value
     p.sent[m, q], p.count[m, q], p.total[m, q] = now, count, record.total[h, q]
     for e in range(record.total[h, q]):
-        copy_kept(p, m, e, record, h, e, q)
+        copy_stored(p, m, e, record, h, e, q)
 
 
 @kernel

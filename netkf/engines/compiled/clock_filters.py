@@ -60,12 +60,11 @@ class ClockFilters:
         infos = scenario.node_infos[:1] if pooled else scenario.node_infos
         self._own = own_sizes(infos, self._columns[1], pooled)
         self._readings = None
-        self._known_pairs: tuple[Any, ...] = (None, None)
+        self._known_pairs: tuple[Any, ...] = ()
         if not (linear := all(sensor.linear for sensor in scenario.sensors)):
             self._readings = nonlinear_sensors(scenario)
             self._p = self._readings.R.shape[1]
-            known = self._readings.setup.tables(scenario.filter.linearise, 1)
-            self._known_pairs = known, self._readings.sources()
+            self._known_pairs = self._readings.of_pairs(scenario.filter.linearise)
         self._rates = [m for m in scenario.model_pieces[0] if isinstance(m, RateModel)]
         models = changing_models(wide_models(scenario), scenario.followed_changes.tolist())
         links = _links_by_receiver(scenario)

@@ -144,15 +144,17 @@ class NonlinearSensors(NamedTuple):
     sensors: list[tuple[Any, int, int]]
     anchors: list[int]
 
-    def sources(self) -> FloatArray:
-        """Return from where readings of pairs are measured, (2 S, p, n, 1)."""
+    def of_pairs(self, method: str) -> tuple[NonlinearRows, FloatArray]:
+        """Return the rows of all sensors as kernels take them, which linearise by a ``method``, and
+        from where readings of pairs are measured, (2 S, p, n, 1).
+        """
         count, (p, n) = len(self.sensors), (self.R.shape[1], self.columns.width)
         made = np.zeros((2 * count, p, n, 1))
         for k, (sensor, node, _) in enumerate(self.sensors):
             if self.setup.kind[count + k, 0] != LINEAR:
                 anchor = node if self.anchors[k] < 0 else self.anchors[k]
                 made[count + k, :, :, 0] = self.setup.reference(sensor, anchor, count + k)
-        return made
+        return self.setup.tables(method, 1), made
 
 
 @once_per_scenario

@@ -60,7 +60,7 @@ from netkf.engines.compiled.slot_steps import StepTimes, absent, step_times
 from netkf.engines.compiled.slot_tables import COLUMNS, SlotTables
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import LANES, MANY, aligned, blocks_of, by_run, in_lanes, unset
-from netkf.linalg.portable import cholesky, noise_root, solve_lower
+from netkf.linalg.portable import cholesky, solve_lower
 from netkf.network.deliveries import Deliveries
 from netkf.plants.faults import FaultyReadings
 from netkf.plants.maps import NonlinearPlant
@@ -183,7 +183,7 @@ class SlotRuns:
             self._map = plant.functions[0]
             self._path = MapPaths(
                 self._map.address, plant.inputs(setup.slots + 1), plant.period,
-                np.stack([noise_root(Q) for Q in plant.noises]),
+                np.stack(plant.noise_roots),
                 np.array(plant.noise_slots, dtype=np.int64), x, *np.zeros((2, setup.n)),
             )  # fmt: skip
             return

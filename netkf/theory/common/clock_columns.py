@@ -78,12 +78,7 @@ class ClockColumns(LoggedColumns):
         self._times = [self._clock_reading(h, 0.0) for h in range(self.estimators)]
         super().__init__()
         self._now = 0.0
-        responses = scenario.input_responses
-        # Estimates are counted from the response that the clock of their node shows.
-        self._response = responses.believed if responses is not None and self._clocks else None
-        for h, shown in enumerate(self._times if self._response is not None else ()):
-            if shown != 0.0:
-                self._filters.restart(h, scenario.prior_shift(scenario.nodes[h], shown))
+        self._response = self._begin_response()
         self._free = list(range(self._filters.messages))[::-1]
         self._uses: Counter[int] = Counter()
         self._source: int | None = None
@@ -113,6 +108,18 @@ class ClockColumns(LoggedColumns):
             for h in range(len(links.first) - 1)
             for w in range(links.first[h], links.first[h + 1])
         }
+
+    def _begin_response(self) -> Any:
+        """Return the response that estimates are counted from, as the clock of their node shows,
+        and let nodes begin there; None if it is that of the truth.
+        """
+        scenario, responses = self._scenario, self._scenario.input_responses
+        if responses is None or responses.believed is None or not self._clocks:
+            return None
+        for h, shown in enumerate(self._times):
+            if shown != 0.0:
+                self._filters.restart(h, scenario.prior_shift(scenario.nodes[h], shown))
+        return responses.believed
 
     def _is_up(self, node: int, time: float) -> bool:
         lives = self._scenario.network.lives

@@ -39,7 +39,7 @@ class KernelColumns:
     def __init__(self, algorithm: Filter) -> None:
         self._algorithm, self.timing = algorithm, algorithm.timing
         assert algorithm.kernels is not None
-        self._names, self._changes = algorithm.kernels.means, algorithm.kernels.counts_sends
+        self._names = algorithm.kernels.means
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: Any) -> ColumnState:
         """Return the state at time 0 from ``mean`` (n, C)."""
@@ -77,17 +77,12 @@ class KernelColumns:
     def emit(self, state: ColumnState, exchange: Exchange) -> tuple[ColumnState, Any]:
         """Return the state after sending, and the payload, None if nothing is sent."""
 
-        def sent(part: int) -> Callable[..., Any]:
-            return lambda *x: self._algorithm.emit(_given(state, iter(x)), exchange)[part]
+        def sent(*x: FloatArray) -> list[Any]:
+            both = self._algorithm.emit(_given(state, iter(x)), exchange)
+            return [one for one in both if one is not None]
 
-        inner, payload = self._algorithm.emit(state.inner, exchange)
-        new = state._replace(inner=inner)
-        if self._changes:
-            new = ColumnState(*self._mapped(sent(0), state.inputs), state.read)
-        told = None
-        if payload is not None:
-            told = ColumnState(*self._mapped(sent(1), state.inputs), state.read)
-        return new, told
+        parts = [ColumnState(*one, state.read) for one in self._all_mapped(sent, state.inputs)]
+        return parts[0], parts[1] if len(parts) > 1 else None
 
     def absorb(
         self, state: ColumnState, messages: Sequence[Message], exchange: Exchange
@@ -114,24 +109,29 @@ class KernelColumns:
         self, verb: Callable[..., Any], inputs: Sequence[FloatArray]
     ) -> tuple[dict[str, FloatArray], Any]:
         """Return the means (k, C) after a verb on ``inputs`` (k, C), and the inner state."""
+        return self._all_mapped(lambda *x: [verb(*x)], inputs)[0]
+
+    def _all_mapped(
+        self, verb: Callable[..., list[Any]], inputs: Sequence[FloatArray]
+    ) -> list[tuple[dict[str, FloatArray], Any]]:
+        """Return ``_mapped`` of each of the states and payloads that a verb returns."""
         ends, columns = np.cumsum([len(part) for part in inputs]), np.concatenate(list(inputs))
         # What is 0 needs no column of the map.
         used = np.flatnonzero(columns.any(axis=1))
 
-        def called(x: FloatArray) -> tuple[Any, list[FloatArray]]:
-            inner = verb(*np.split(x, ends[:-1]))
-            return inner, [_mean(inner, name).ravel() for name in names]
+        def called(x: FloatArray) -> list[Any]:
+            return verb(*np.split(x, ends[:-1]))
 
-        inner = verb(*np.split(np.zeros(ends[-1]), ends[:-1]))
-        names = [name for name in self._names if name in inner._fields]
-        base = [_mean(inner, name).ravel() for name in names]
-        units = [called(e)[1] for e in np.eye(ends[-1])[used]]
-        made = {}
-        for k, (name, zero) in enumerate(zip(names, base, strict=True)):
-            unit = np.array([one[k] - zero for one in units]).reshape(len(used), len(zero))
-            made[name] = unit.T @ columns[used]
-            made[name][:, MEAN] += zero
-        return made, inner
+        units, found = [called(e) for e in np.eye(ends[-1])[used]], []
+        for k, inner in enumerate(called(np.zeros(ends[-1]))):
+            made = {}
+            for name in (name for name in self._names if name in inner._fields):
+                zero = _mean(inner, name).ravel()
+                unit = np.array([_mean(one[k], name).ravel() - zero for one in units])
+                made[name] = unit.reshape(len(used), len(zero)).T @ columns[used]
+                made[name][:, MEAN] += zero
+            found.append((made, inner))
+        return found
 
 
 def _mean(inner: Any, name: str) -> FloatArray:
