@@ -5,6 +5,7 @@ import os
 import pty
 import re
 import resource
+import select
 import shlex
 import signal
 import subprocess
@@ -255,7 +256,9 @@ def test_a_terminal_shows_a_rate_and_what_is_left_and_a_pipe_nothing():
     here, there = pty.openpty()
     command = [sys.executable, "-c", PROGRESS]
     subprocess.run(command, stdin=there, stdout=there, stderr=there, check=True)
-    shown = os.read(here, 10_000).decode()
+    shown = ""
+    while not shown.endswith("end\r\n") and select.select([here], [], [], 10.0)[0]:
+        shown += os.read(here, 10_000).decode()  # a terminal hands on part by part
     os.close(here), os.close(there)
     clear = re.escape("\r\x1b[K")
     rate = r"5 of 10 runs, [\d.e+]+ per second, about 0 s left"
