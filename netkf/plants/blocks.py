@@ -270,7 +270,7 @@ def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
     plants = _plants(blocks)
     is_random = all(plant.is_random for plant in plants)
     if not all(plant.linear for plant in plants):
-        return _stack_nonlinear(blocks)
+        return _stack_nonlinear(blocks, layout)
     mean = np.concatenate([plant.start_mean for plant in plants])
     cov = block_diagonal([plant.start_cov for plant in plants])
     parts: dict[str, Any] = {
@@ -287,7 +287,7 @@ def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
     return Diffusion(**parts) if is_random else RecordedDiffusion(**parts)
 
 
-def _stack_nonlinear(blocks: Sequence[Block]) -> Plant:
+def _stack_nonlinear(blocks: Sequence[Block], layout: Layout) -> Plant:
     slotted = isinstance(blocks[0].plant, SlotPlant)
     for k, block in enumerate(blocks):
         _check_beside_nonlinear(k, block)
@@ -301,8 +301,10 @@ def _stack_nonlinear(blocks: Sequence[Block]) -> Plant:
         else:
             parts.append(BlockPart(plant.f, plant.n, m))
     inputs = [plant.input for plant in plants if plant.input is not None]
+    coupling = np.zeros((layout.n, layout.n))
+    _add_couplings(coupling, blocks, layout)
     shared: dict[str, Any] = {
-        "f": StackedDynamics(tuple(parts)),
+        "f": StackedDynamics(tuple(parts), coupling),
         "mean": np.concatenate([plant.start_mean for plant in plants]),
         "cov": block_diagonal([plant.start_cov for plant in plants]),
         "input": StackedInput(inputs=tuple(inputs)) if inputs else None,
@@ -332,10 +334,9 @@ def _noise_at(plant: Any, name: str, time: float) -> FloatArray:
 def _check_beside_nonlinear(k: int, block: Block) -> None:
     """Raise ScenarioError if block number ``k`` cannot stand among blocks that are not linear."""
     plant = block.copies[0]
-    for key, given in (("coupling", block.coupling), ("schedule", plant.changes)):
-        if len(given):
-            rule = "must be left out where blocks are not linear, whose f says it with x and t"
-            raise ScenarioError(f"[{k}].{key}", rule, None, "write one f for all of it")
+    if len(plant.changes):
+        rule = "must be left out where blocks are not linear, whose f says it with x and t"
+        raise ScenarioError(f"[{k}].schedule", rule, None, "write one f for all of it")
     if plant.linear:
         _check_gain(k, plant.input, plant.n)
     else:

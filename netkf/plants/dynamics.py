@@ -98,19 +98,25 @@ class BlockPart(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class StackedDynamics(Component):
-    """The dynamics of blocks side by side, which do not drive each other."""
+    """The dynamics of blocks side by side; by ``coupling`` (n, n), 0 within blocks, they drive each
+    other.
+    """
 
     parts: tuple[BlockPart, ...]
+    coupling: FloatArray
 
-    def chosen(self, entries: np.ndarray) -> tuple[tuple[BlockPart, ...], np.ndarray]:
-        """Return the parts of whole blocks whose states are ``entries`` (n',), in their order, and
-        the numbers (m',) of their inputs.
+    def chosen(self, entries: np.ndarray) -> tuple[StackedDynamics, np.ndarray]:
+        """Return the dynamics of whole blocks whose states are ``entries`` (n',), in their order,
+        and the numbers (m',) of their inputs.
         """
         ends = np.cumsum([part.n for part in self.parts])
         lasts = np.cumsum([part.m for part in self.parts])
         order = dict.fromkeys(np.searchsorted(ends, entries, side="right").tolist())
         inputs = [np.arange(lasts[k] - self.parts[k].m, lasts[k]) for k in order]
-        return tuple(self.parts[k] for k in order), np.concatenate([np.zeros(0, int), *inputs])
+        stacked = StackedDynamics(
+            tuple(self.parts[k] for k in order), self.coupling[np.ix_(entries, entries)]
+        )
+        return stacked, np.concatenate([np.zeros(0, int), *inputs])
 
 
 class _Linear:
@@ -129,15 +135,22 @@ class _Linear:
 class _Stacked:
     """The values of the functions of blocks side by side, or their Jacobians as one."""
 
-    def __init__(self, functions: tuple[VectorFunction, ...], parts: Any, matrices: bool) -> None:
-        self._functions, self._parts, self._matrices = functions, parts, matrices
+    def __init__(
+        self, functions: tuple[VectorFunction, ...], f: StackedDynamics, matrices: bool
+    ) -> None:
+        self._functions, self._f, self._matrices = functions, f, matrices
+        self._is_coupled = f.coupling.any()
 
     def __call__(self, x: FloatArray, u: FloatArray, t: float, period: float) -> FloatArray:
         values, i, j = [], 0, 0
-        for function, part in zip(self._functions, self._parts, strict=True):
+        for function, part in zip(self._functions, self._f.parts, strict=True):
             values.append(function(x[i : i + part.n], u[j : j + part.m], t, period))
             i, j = i + part.n, j + part.m
-        return block_diagonal(values) if self._matrices else np.concatenate(values)
+        result = block_diagonal(values) if self._matrices else np.concatenate(values)
+        if not self._is_coupled:
+            return result
+        driven = self._f.coupling if self._matrices else apply(self._f.coupling, x)
+        return np.asarray(result + driven)
 
 
 class _LinearMap:
@@ -215,7 +228,7 @@ def functions_of(f: Any, n: int, m: int, in_slots: bool) -> Any:
         ]  # fmt: skip
         return tuple(
             VectorFunction(
-                _Stacked(functions, f.parts, matrices), shape, is_kernel=False, takes_period=True
+                _Stacked(functions, f, matrices), shape, is_kernel=False, takes_period=True
             )
             for functions, shape, matrices in zip(
                 zip(*pairs, strict=True), shapes, (False, True), strict=True

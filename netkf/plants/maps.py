@@ -58,8 +58,7 @@ class NonlinearStates(RecordedStates):
         """Return f and its Jacobian of the blocks whose states are ``entries`` (n',), and the
         numbers of their inputs (m',).
         """
-        parts, inputs = self.f.chosen(entries)
-        stacked = StackedDynamics(parts)
+        stacked, inputs = self.f.chosen(entries)
         return functions_of(stacked, len(entries), len(inputs), self.in_slots), inputs
 
     def check_dynamics(self) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from bisect import bisect_right
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from netkf.algorithms.filter import Exchange, Filter, may_be_silent
 from netkf.algorithms.translation import read_vector
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import walk
-from netkf.linalg.arrays import is_definite
+from netkf.linalg.arrays import FloatArray, is_definite
 from netkf.linalg.spectra import hidden_mode, outputs_of
 from netkf.network.clocks import LinkClock
 from netkf.network.contacts import Contacts
@@ -76,7 +77,8 @@ def _check_blocks(scenario: DerivedScenario) -> None:
     name, talks = filter_name(scenario), scenario.node_filter.timing.talks
     if scenario.node_filter.timing.pooled:
         return
-    knows_blocks = scenario.node_filter.needs.blocks
+    needs = scenario.node_filter.needs
+    knows_blocks = needs.blocks
     unread = talks and not knows_blocks and len(set(scenario.estimated)) > 1
     if unread and not _translates(scenario):
         rule = f"must be the same blocks for all nodes for the {name}, whose messages say no blocks"
@@ -85,13 +87,11 @@ def _check_blocks(scenario: DerivedScenario) -> None:
     for k, node in enumerate(scenario.nodes):
         view = scenario.view(k)
         others = np.setdiff1d(np.arange(scenario.plant.n), view)
-        # Blocks of a plant that is not linear drive nobody.
-        closed = scenario.node_filter.needs.coupled or not scenario.plant.linear
-        pieces = () if closed else scenario.believed_pieces
-        if any(M[np.ix_(view, others)].any() for M, _ in pieces):
+        couplings: Iterable[FloatArray] = () if needs.coupled else _couplings(scenario)
+        if any(M[np.ix_(view, others)].any() for M in couplings):
             rule = f"must contain all that drives the blocks of node {node}"
             remedy = 'write kind = "partition"'
-            if not scenario.node_filter.needs.own_blocks:
+            if not needs.own_blocks:
                 remedy += ', or estimate the coupled blocks too, as "all" does'
             raise ScenarioError("filter.estimates", rule, scenario.filter.estimates, remedy)
         for placed in scenario.placed_sensors.get(node, ()):
@@ -108,6 +108,14 @@ def _check_blocks(scenario: DerivedScenario) -> None:
             if not (scenario.slotted or takes_samples(sensor)):
                 rule = "is missing: increments of two blocks need both estimates"
                 raise ScenarioError(f"{key}.sampling", rule, None, f"add {SAMPLING}")
+
+
+def _couplings(scenario: DerivedScenario) -> list[FloatArray]:
+    """Return matrices (n, n) by which blocks drive each other, as filters believe."""
+    plant: Any = scenario.plant
+    if not plant.linear:
+        return [plant.f.coupling]
+    return [M for M, _ in scenario.believed_pieces]
 
 
 def _wider_estimates(scenario: DerivedScenario) -> str:

@@ -532,7 +532,7 @@ def test_nodes_move_their_own_blocks_by_their_own_dynamics(tmp_path: Path) -> No
     assert np.trace(run.P[1, 1, :2, :2]) < 0.2 + 0.162 + 0.04
     drawn = load(UNICYCLES.replace('path = "sights.csv"', "to = [[1, 2]]"), tmp_path, own)
     assert len(netkf.consistency(drawn, runs=10, workers=1).rows) == 2
-    with pytest.raises(netkf.ScenarioError, match=r"plants\[0\].coupling: must be left out"):
+    with pytest.raises(netkf.ScenarioError, match=r"plants\[0\].coupling\[0\].A: must be 3 x 2"):
         load(UNICYCLES, tmp_path, {"plants.0.coupling": [{"from": [2], "A": [[1.0]]}]})
     with pytest.raises(netkf.ScenarioError, match=r"plants\[0\].input: must have 2 components"):
         load(UNICYCLES, tmp_path, {"plants.0.input": {"kind": "constant", "value": [1.0]}})

@@ -100,8 +100,23 @@ def update(x, P, v, H, R):
     return x + K @ v, P - K @ H @ P
 
 
+TO_POSE = np.array([[0.02, 0.0], [0.01, -0.03], [0.0, 0.05]])
+TO_TARGET = np.array([[0.0, 0.1, 0.2], [-0.1, 0.0, 0.0]])
+
+
+def coupled(scenario):
+    """Node 1 is driven by the target, and the target by it."""
+    plants = [dict(plant) for plant in scenario.to_table()["plants"]]
+    plants[0]["coupling"] = [{"from": "target", "A": TO_POSE.tolist()}]
+    plants[2]["coupling"] = [{"from": [1], "A": TO_TARGET.tolist()}]
+    return scenario.replace({"plants": plants})
+
+
+@pytest.mark.parametrize("is_coupled", [False, True])
 @pytest.mark.parametrize("engine", ["simpy", "compiled"])
-def test_the_central_filter_is_a_plain_ekf_of_all_blocks(scenario, engine):
+def test_the_central_filter_is_a_plain_ekf_of_all_blocks(scenario, engine, is_coupled):
+    if is_coupled:
+        scenario = coupled(scenario)
     run = netkf.simulate(scenario, engine=engine)
     x = np.array([*STARTS[1], *STARTS[2], 0.0, 0.0])
     P = np.diag([0.1, 0.1, 0.02] * 2 + [1.0, 1.0])
@@ -112,10 +127,14 @@ def test_the_central_filter_is_a_plain_ekf_of_all_blocks(scenario, engine):
     told = {2: (0.4, 0.1), 4: (0.5, -0.2)}
     for k in range(1, 6):
         J = np.zeros((8, 8))
+        if is_coupled:
+            J[:3, 6:], J[6:, :3] = TO_POSE, TO_TARGET
+        driven = J @ x
         x[:3], J[:3, :3] = arc(x[:3], U[1])
         x[3:6], J[3:6, 3:6] = arc(x[3:6], U[2])
         x[6:] = F_TARGET @ x[6:] + G[:, 0] * math.sin(2.0 * math.pi * 0.2 * 0.5 * (k - 1))
         J[6:, 6:] = F_TARGET
+        x += driven
         P = J @ P @ J.T + Q
         expected, H = sight(x)
         rows, R = np.zeros((0, 8)), np.zeros((0, 0))
@@ -212,13 +231,103 @@ def test_blocks_in_continuous_time_are_integrated_side_by_side(scenario):
         np.testing.assert_allclose(both.P[:, 0, entries, entries], one.P[:, 0], atol=1e-10)
 
 
+class Damped:
+    """A linear f, of a block in slots or in continuous time."""
+
+    F = np.array([[0.9, 0.2], [-0.1, 0.7]])
+
+    def f(self, x, u, t):
+        return self.F @ x
+
+    def jacobian(self, x, u, t):
+        return self.F
+
+
+@pytest.mark.parametrize("kind", ["central", "diffusion"])
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_coupled_blocks_whose_f_is_linear_are_the_linear_plant_to_the_bit(scenario, kind, engine):
+    C = [[0.3, 0.0], [0.1, -0.2]]
+    block = {"name": "area", "Q": [[0.2, 0.1], [0.1, 0.3]], "period": 0.5}
+    runs = []
+    for dynamics in ({"kind": "nonlinear", "f": Damped}, {"F": Damped.F.tolist()}):
+        plants = [
+            {**block, **dynamics, "nodes": [1], "coupling": [{"from": [2], "A": C}]},
+            {**block, "F": [[0.5, 0.0], [0.0, 0.6]], "nodes": [2], "name": "other",
+             "coupling": [{"from": [1], "A": C}]},
+        ]  # fmt: skip
+        sensor = {"H": [[1.0, 0.0]], "R": [[0.2]]}
+        sensors = [
+            {**sensor, "of": name, "nodes": [node]} for name, node in (("area", 1), ("other", 2))
+        ]
+        changes = {"plants": plants, "sensors": sensors, "filter": {"kind": kind}}
+        runs.append(netkf.simulate(scenario.replace(changes), seed=3, engine=engine))
+    for name in ("x", "xhat", "P"):
+        np.testing.assert_array_equal(*(getattr(run, name) for run in runs))
+
+
+def areas(f):
+    """A pose that drives two areas of a grid, of which each drives the other, by ``f`` of one."""
+    area = {"B": [[0.3], [0.1]], "mean": [1.0, -0.5], "cov": np.eye(2).tolist()}
+    C = [[0.3, 0.0], [0.1, -0.2]]
+    own = {"A": (Damped.F - np.eye(2)).tolist()}
+    rate = {"kind": "nonlinear", "f": Rate, "step": 0.01} if f else own
+    return [
+        {**area, **rate, "name": "west", "nodes": [1], "coupling": [{"from": [2], "A": C}]},
+        {**area, **own, "name": "east", "nodes": [2], "coupling": [{"from": [1], "A": C}]},
+    ]
+
+
+class Rate(Damped):
+    F = Damped.F - np.eye(2)
+
+
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_coupled_blocks_in_continuous_time_are_the_linear_ones_to_the_order(scenario, engine):
+    sensor = {"H": [[1.0, 0.0]], "R": [[0.2]], "sampling": {"kind": "periodic", "period": 0.25}}
+    changes = {
+        "sensors": [
+            {**sensor, "of": name, "nodes": [node]} for name, node in (("west", 1), ("east", 2))
+        ],
+        "network": {"graph": {"kind": "edges", "edges": [[1, 2]]}},
+        "filter": {"kind": "central"},
+    }
+    curved, linear = (
+        netkf.simulate(scenario.replace(changes | {"plants": areas(f)}), engine=engine, seed=1)
+        for f in (True, False)
+    )
+    np.testing.assert_allclose(curved.P, linear.P, rtol=1e-7)
+    # The truth, whose noise inside steps is another, obeys the same law: so do the errors.
+    assert np.abs(curved.x - curved.xhat).max() < 5.0 * np.sqrt(linear.P.max())
+
+
+def test_estimates_have_all_that_drives_them_beside_curved_blocks_too(scenario):
+    changes = {
+        "filter": {"kind": "local", "estimates": "own"},
+        "sensors": [
+            {"kind": "range", "of": "pose", "nodes": [1, 2], "R": [[0.04]],
+             "positions": [[-1.0, 2.0], [1.0, 0.0]]}
+        ],
+    }  # fmt: skip
+    with pytest.raises(netkf.ScenarioError, match=r"estimates: must contain all that drives .* 1"):
+        coupled(scenario.replace(changes))
+    changes["filter"]["estimates"] = ["pose", "target"]
+    run = netkf.simulate(coupled(scenario.replace(changes)), seed=4)
+    changes["filter"] = {"kind": "central"}
+    whole = netkf.simulate(coupled(scenario.replace(changes)), seed=4)
+    np.testing.assert_array_equal(run.x, whole.x)
+    # What node 1 knows of its own pose and the target, nothing of node 2 helps or harms.
+    own = [0, 1, 2, 6, 7]
+    np.testing.assert_allclose(run.xhat[:, 0, :5], whole.xhat[:, 0, own], atol=1e-12)
+    np.testing.assert_allclose(run.P[:, 0, :5, :5], whole.P[:, 0][:, own][:, :, own], atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("key", "value", "words"),
     [
         (
             "coupling",
             [{"from": "target", "A": [[0.0] * 2] * 3}],
-            "plants[0].coupling: must be",
+            "plants[0].coupling[0].A: must be 3 x 1",
         ),
         ("input", {"kind": "constant", "value": 1.0}, "plants[0].input: must have 2 components"),
         ("period", 0.25, "plants[0].period: must be the same in all entries"),
@@ -250,19 +359,13 @@ def test_mistakes_in_sensors_of_blocks_are_those_of_the_file(scenario, key, valu
     assert str(caught.value).startswith(f"sensors[0].{words}")
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("schedule", [{"from": 1.0, "F": [[0.5]]}]),
-        ("coupling", [{"from": "pose", "A": [[0.1, 0.0, 0.0]]}]),
-    ],
-)
-def test_changes_and_coupling_beside_curved_blocks_are_refused_in_one_line(scenario, key, value):
+def test_changes_of_dynamics_beside_curved_blocks_are_refused_in_one_line(scenario):
     plants = poses(period=0.5, Q=Q_POSE.tolist())
-    target = {"name": "target", "F": [[1.0]], "Q": [[1.0]], "period": 0.5, key: value}
+    target = {"name": "target", "F": [[1.0]], "Q": [[1.0]], "period": 0.5}
+    target["schedule"] = [{"from": 1.0, "F": [[0.5]]}]
     with pytest.raises(netkf.ScenarioError) as caught:
         scenario.replace({"plants": [*plants, target]})
-    wanted = f"plants[{len(plants)}].{key}: must be left out where blocks are not linear"
+    wanted = f"plants[{len(plants)}].schedule: must be left out where blocks are not linear"
     assert str(caught.value).startswith(wanted)
     assert "\n" not in str(caught.value)
 
