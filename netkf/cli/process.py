@@ -156,8 +156,9 @@ def collect_garbage_later() -> None:
 
     def collect() -> None:
         time.sleep(KEEPING_SECONDS)
-        # What was imported until now stays: it need not be looked through again and again.
+        # What was imported until now stays: as old objects it is looked through seldom.
         gc.freeze()
+        gc.unfreeze()
         gc.enable()
 
     gc.disable()

@@ -307,6 +307,7 @@ def _compile_well(function: Any, method: str, loops: Callable[..., Any]) -> None
         finally:
             config.OPT = before
             if collects:
+                _count_as_old()
                 gc.enable()
             # LLVM options cannot be unset: this is the value that numba's own level implies.
             set_option("netkf", f"-unroll-threshold={UNROLLED_BY_NUMBA}")
@@ -315,6 +316,14 @@ def _compile_well(function: Any, method: str, loops: Callable[..., Any]) -> None
             _compile_times.append(time.perf_counter() - started)
 
     setattr(function, method, compile_with_settings)
+
+
+def _count_as_old() -> None:
+    """Leave all objects to the next full collection: visiting the new ones now takes as long."""
+    # What others have frozen stays frozen.
+    if gc.get_freeze_count() == 0:
+        gc.freeze()
+        gc.unfreeze()
 
 
 def seconds_spent() -> float:
