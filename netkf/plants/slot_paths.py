@@ -75,10 +75,10 @@ def draw_starts(
         first, count = b * len(lanes), root.shape[1]
         draw_normals(lanes, states, first, 1, len(states) - first, ziggurat, scratch, count)
         for i in range(len(mean)):
-            total = spread(lanes, mean[i])
+            noise = spread(lanes, 0.0)
             for j in range(count):
-                total += root[i, j] * load(lanes, scratch, j)
-            store(lanes, x, b, i, total)
+                noise += root[i, j] * load(lanes, scratch, j)
+            store(lanes, x, b, i, mean[i] + noise)
 
 
 @kernel
@@ -112,12 +112,12 @@ def move_path(
             store(lanes, path.x, b, i, 0.0)
     # x <- F x + root z, in local coordinates.
     for i in range(n):
-        total = spread(lanes, 0.0)
+        total, noise = spread(lanes, 0.0), spread(lanes, 0.0)
         for j in range(n):
             total += path.F[i, j] * load(lanes, path.x, b, j)
         for j in range(path.root.shape[1]):
-            total += path.root[i, j] * load(lanes, normals, j)
-        store(lanes, moved, i, total)
+            noise += path.root[i, j] * load(lanes, normals, j)
+        store(lanes, moved, i, total + noise)
     for i in range(n):
         store(lanes, path.x, b, i, load(lanes, moved, i))
     # origin <- F origin: it moves with the plant, without noise.
@@ -212,10 +212,10 @@ def draw_map_paths(
                     path.given[i] = path.x[b, i, q]
                 call_function(path.f, path.given, u, t, path.period, path.moved)
                 for i in range(n):
-                    total = path.moved[i]
+                    noise = 0.0
                     for j in range(columns):
-                        total += path.roots[piece, i, j] * scratch[j, q]
-                    path.x[b, i, q] = total
+                        noise += path.roots[piece, i, j] * scratch[j, q]
+                    path.x[b, i, q] = path.moved[i] + noise
 
 
 class SlotSensors(NamedTuple):

@@ -10,6 +10,7 @@ import pytest
 import netkf
 from netkf.engines.simpy.engine import SimpyEngine
 from netkf.trace.schema import CODES
+from tests.conftest import SCENARIOS
 
 GRID = {"kind": "grid", "rows": 3, "columns": 3}
 
@@ -50,6 +51,19 @@ def test_same_seed_same_bits(ring):
     same(netkf.simulate(ring), netkf.simulate(ring))
     other = netkf.simulate(ring, replica=1)
     assert other.fingerprint != netkf.simulate(ring).fingerprint
+
+
+SLOTS = ("push_sum_planar", "gossip_ring", "diffusion_regression", "nonlinear/range_tracking")
+
+
+@pytest.mark.parametrize("name", SLOTS)
+def test_the_truth_in_slots_has_the_same_bits_in_both_engines(name):
+    """Sums have one order: with frames or without, linear or not."""
+    scenario = netkf.load(SCENARIOS / f"{name}.toml")
+    period = scenario.plant.period
+    scenario = scenario.replace({"horizon": 40 * period, "probe": period})
+    one, other = (netkf.simulate(scenario, engine=engine) for engine in ("simpy", "compiled"))
+    np.testing.assert_array_equal(one.x, other.x)
 
 
 def test_same_bits_in_another_process(ring, tmp_path):
