@@ -94,7 +94,7 @@ def _summarise(scenario: Scenario, run: Run) -> ReplicaSummary:
     #                      readings: a point of the support of the invariant law, R Theorem 10
     # spread (N,)          trace of the difference between P from a very large start and P from 0;
     #                      the recursion is monotone: any other start ends between these two
-    # averages (N,)        averages of 1 / (1 + tr P) over the second half of the slots
+    # averages (N,)        averages of u / (u + tr P), u = tr Q, over the second half of the slots
     # sent, arrived (D,)   readings sent and delivered in time
     slots, summary = list(check_slots(scenario)), summarise_exactly(scenario, run)
     last = slots[-1:]
@@ -136,11 +136,14 @@ def _count_messages(scenario: Scenario, run: Run, kind: str, slots: int) -> np.n
 
 
 def _path_averages(table: ModeTable, roots: FloatArray, sequences: np.ndarray) -> FloatArray:
-    """Return for each of K filters the average of ``1 / (1 + tr P)`` over half of the slots."""
+    """Return for each of K filters the average of ``u / (u + tr P)`` over half of the slots; u is
+    tr Q, or that of the start if Q is 0.
+    """
     first, averages = sequences.shape[1] // 2, []
-    for all_slots in trace_paths(roots, sequences, *table):
+    for root, all_slots in zip(roots, trace_paths(roots, sequences, *table), strict=True):
         path = all_slots[first:]  # (slots, n, n) roots S with P = S S', so tr P is their square sum
-        averages.append(float((1.0 / (1.0 + np.einsum("tab,tab->t", path, path))).mean()))
+        unit = float((table.root_Q**2).sum() or (root**2).sum() or 1.0)
+        averages.append(float((unit / (unit + np.einsum("tab,tab->t", path, path))).mean()))
     return np.array(averages)
 
 
@@ -269,7 +272,7 @@ def _averages_of_paths(samples: IntermittentSamples, level: float) -> Finding:
         for i, node in enumerate(samples.nodes)
     ]
     message = (
-        f"averages of 1/(1 + tr P) over one path: {averages.mean():.4g} +- "
+        f"averages of 1/(1 + tr P / tr Q) over one path: {averages.mean():.4g} +- "
         f"{averages.std(axis=0).mean():.2g} in the runs, {expected.mean():.4g} +- "
         f"{expected.std(axis=1).mean():.2g} by the stated law; distance of their laws"
     )

@@ -331,7 +331,8 @@ def _counts_directions(table: pd.DataFrame) -> bool:
     if not (table["what"] == "outcome").all():
         return False
     many = table.groupby("sender")["receiver"].nunique().max() > 1
-    return bool(many and not table.duplicated(["sender", "t"]).any())
+    messages = table.drop_duplicates(["sender", "t", "receiver", "number"])
+    return bool(many and not messages.duplicated(["sender", "t"]).any())
 
 
 def _number_transmissions(table: pd.DataFrame, notes: list[str], log: str) -> pd.Series:
@@ -377,7 +378,10 @@ def _number_transmissions(table: pd.DataFrame, notes: list[str], log: str) -> pd
 
 def _by_stamps(table: pd.DataFrame) -> pd.Series:
     """Return the key where messages of one sender and stamp are one transmission."""
-    again = table.groupby(["sender", "t", "receiver"]).cumcount()
+    # Of several at one stamp numbers tell the order, and rows that say one thing again.
+    order = table["number"].fillna(pd.Series(table.index - len(table), table.index))
+    groups = order.groupby([table["sender"], table["t"], table["receiver"]])
+    again = (groups.rank("dense") - 1.0).astype(int)
     table["counter"] = again
     told = zip(table["sender"], table["t"].tolist(), again.tolist(), strict=True)
     return pd.Series([_key(i, t, k) for i, t, k in told], index=table.index)

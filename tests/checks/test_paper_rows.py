@@ -61,6 +61,18 @@ def test_averages_over_one_path():
     assert growing.margin[0] == pytest.approx(60 * np.log(2 * 0.7), rel=0.02)
 
 
+@pytest.mark.usefixtures("few_laws")
+def test_averages_over_one_path_have_no_units():
+    """The row compares the same numbers whatever the unit of the state."""
+    matrices = ("plant.Q", "plant.cov", "sensors.0.R")
+    given, scaled = load("intermittent_scalar"), {key: [[2.0**-20]] for key in matrices}
+    found = [
+        collect(intermittent.CHECKS, scenario, 4).runs.averages
+        for scenario in (given, given.replace(scaled))
+    ]
+    np.testing.assert_allclose(*found, rtol=1e-12)
+
+
 def test_the_mean_diverges_at_a_node_without_a_neighbour_that_has_a_sensor():
     far = load("intermittent_scalar", **{"network.graph": {"kind": "path", "nodes": 3}})
     samples = collect(intermittent.CHECKS, far, 20)

@@ -611,6 +611,26 @@ kind = "gossip"
 """
 
 
+@pytest.mark.parametrize("steps", [0, 2])
+def test_rows_of_a_run_may_stand_in_any_order_and_repeat(steps, tmp_path):
+    """Of several messages of a direction at one instant their numbers tell the order."""
+    text = PAIRS.replace("symmetric", 'loss = { kind = "bernoulli", delivery = 0.5 }, symmetric')
+    if steps:
+        text = text.replace('matching", protocol = "one-edge"', 'broadcast"')
+        text = text.replace('"gossip"', f'"hcmci"\nsteps = {steps}')
+    (tmp_path / "run.toml").write_text(text)
+    netkf.export_log(netkf.simulate(netkf.load(tmp_path / "run.toml")), tmp_path / "log")
+    packets = tmp_path / "log" / "packets.csv"
+    source, head, *rows = packets.read_text().splitlines()
+    found = []
+    for order in (rows, [*rows[::-1], rows[3]]):
+        write(packets, [source, head, *order])
+        netkf.import_log(tmp_path / "log", "csv", tmp_path / f"out{len(found)}")
+        outcomes = table(tmp_path / f"out{len(found)}", "outcomes.csv")
+        found.append(outcomes.drop(columns="transmission").sort_values([*outcomes][:3]))
+    np.testing.assert_array_equal(*found)
+
+
 @pytest.mark.parametrize(
     ("rows", "sent", "told"),
     [
