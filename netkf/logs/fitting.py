@@ -314,13 +314,19 @@ def run_tests(
     if len(parts) > 1:
         own = np.tile(counts[:, 1] / np.maximum(counts[:, 0], 1.0), (len(parts), 1)).ravel()
         flat, spreads = parts.reshape(-1, 2), np.tile(spread, len(parts))
-        found["channel"] = stats.test_identical(flat, own, spreads, len(counts))
+        used = _count_uncertain(own[: len(counts)])
+        found["channel"] = stats.test_identical(flat, own, spreads, used)
     found |= _direction_test(outcomes, counts, slack)
     if distance is not None and len(counts) > 2:
         values, _ = stats.fit_distance(*distance[:3], slack)
         curve = distance.mean_by_link(expit((values[0] - distance.value) / values[1]))
         found["distance"] = stats.test_identical(counts, curve, spread, 2)
     return found, share, time, edges
+
+
+def _count_uncertain(delivery: FloatArray) -> int:
+    """Return how many deliveries were estimated from packets that were not all heard, or lost."""
+    return int(((delivery > 0.0) & (delivery < 1.0)).sum())
 
 
 def _direction_test(outcomes: LogOutcomes, counts: FloatArray, slack: float) -> dict[str, Test]:
@@ -333,7 +339,8 @@ def _direction_test(outcomes: LogOutcomes, counts: FloatArray, slack: float) -> 
     together = counts[order].reshape(2, -1, 2).sum(axis=0)
     expected = np.tile(together[:, 1] / np.maximum(together[:, 0], 1.0), 2)
     spread = np.full(len(order), slack)
-    return {"directions": stats.test_identical(counts[order], expected, spread, len(both))}
+    used = _count_uncertain(expected[: len(both)])
+    return {"directions": stats.test_identical(counts[order], expected, spread, used)}
 
 
 def _test_table(tests: Mapping[str, Test], level: float) -> pd.DataFrame:

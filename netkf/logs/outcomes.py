@@ -343,13 +343,18 @@ def test_memory(outcomes: LogOutcomes) -> Test:
         x, unbroken = group.x, _unbroken(group.follows, 2)
         now, last, first = x[2:], x[1:-1], x[:-2]
         known = np.isfinite(now + last + first) & unbroken[:, None]
+        pieces = np.cumsum(np.diff(known, axis=0, prepend=False) & known, axis=0)
         part = np.zeros_like(now)
         for state in (0.0, 1.0):
             chosen = known & (last == state)
+            chosen &= chosen.sum(axis=0) >= MIN_PACKETS
             n = np.maximum(chosen.sum(axis=0), 1)
             a, b = (np.where(chosen, v, 0.0).sum(axis=0) / n for v in (now, first))
             size = np.sqrt(a * (1 - a) * b * (1 - b))
-            part += np.where(chosen, (now - a) * (first - b) + size / n, 0.0)
+            # The one before is what came after the last time, in an unbroken piece.
+            seen = np.maximum.accumulate(np.where(chosen, pieces, 0), axis=0)
+            again = 1.0 - (np.diff(seen, axis=0, prepend=0) > 0).sum(axis=0) / n
+            part += np.where(chosen, (now - a) * (first - b) + again * size / n, 0.0)
             scale += float((chosen.sum(axis=0) * size).sum())
         units.append(part.sum(axis=1))
     return _z_test("correlation given the last", np.concatenate([*units, np.empty(0)]), scale)

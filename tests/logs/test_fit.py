@@ -1,5 +1,6 @@
 """Laws of losses against synthetic logs whose laws are known."""
 
+import itertools
 import json
 import math
 
@@ -93,6 +94,24 @@ def test_true_laws_are_kept_and_parameters_lie_in_their_intervals():
     assert rate(together) > low
     for flags in rejected.values():
         assert rate(flags) < binomial_range(200, LEVEL)[1]
+
+
+def test_true_assumptions_are_kept_where_packets_hop_and_links_lose_nothing():
+    """At random over three channels few follow each other; perfect links take no parameter."""
+    pairs = tuple(itertools.permutations("0123", 2))
+    p = np.where([{i, j} < {"0", "1", "2"} for i, j in pairs], 0.7, 1.0).reshape(4, 3)
+    rejected = {"memory": [], "channel": [], "directions": []}
+    for random in seeds(100, 9):
+        groups = []
+        for x, t, _, ids in drawn(random, T=250, p=p, senders=4).groups:
+            channel = random.integers(3, size=len(t))
+            for own in (np.flatnonzero(channel == k) for k in range(3)):
+                follows = np.diff(own, prepend=-2) == 1
+                groups.append(Group(x[own], t[own], follows, ids))
+        tests, *_ = run_tests(LogOutcomes(pairs, tuple(groups), ("a", "b", "c") * 4), None)
+        for name, flags in rejected.items():
+            flags.append(tests[name].p < LEVEL)
+    assert max(map(rate, rejected.values())) < binomial_range(100, LEVEL)[1]
 
 
 @pytest.mark.parametrize("share", [0.0, 0.7, 1.0])
