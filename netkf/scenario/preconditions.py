@@ -90,9 +90,10 @@ def _check_blocks(scenario: DerivedScenario) -> None:
         couplings: Iterable[FloatArray] = () if needs.coupled else _couplings(scenario)
         if any(M[np.ix_(view, others)].any() for M in couplings):
             rule = f"must contain all that drives the blocks of node {node}"
-            remedy = 'write kind = "partition"'
+            remedies = ['write kind = "partition"'] if scenario.plant.linear else []
             if not needs.own_blocks:
-                remedy += ', or estimate the coupled blocks too, as "all" does'
+                remedies.append('estimate the coupled blocks too, as "all" does')
+            remedy = ", or ".join(remedies or [ANOTHER + ', estimates = "all"'])
             raise ScenarioError("filter.estimates", rule, scenario.filter.estimates, remedy)
         for placed in scenario.placed_sensors.get(node, ()):
             support = scenario.support(placed)
