@@ -47,11 +47,13 @@ class Columns(dict[str, FloatArray]):
     source, lines : the file, and the number (K,) of each row's line in it
     half_digits : (K,), half of the last digit of each stamp t in seconds; empty without such a
                   column
+    file_rows : the number of all rows of the file, of which these may be a part
     """
 
     def __init__(self, source: SourceFile, lines: np.ndarray, half_digits: FloatArray) -> None:
         super().__init__()
         self.source, self.lines, self.half_digits = source, lines, half_digits
+        self.file_rows = len(lines)
 
     def where(self, *rows: int) -> str:
         """Return the name of the file and the lines of ``rows`` (indices), as messages begin."""
@@ -85,6 +87,7 @@ class Columns(dict[str, FloatArray]):
             rule = f"{self.source.name} has no row of node {node}"
             raise ScenarioError("path", rule, None, "add some, or take it from nodes")
         rows = Columns(self.source, self.lines[chosen], self.half_digits[chosen])
+        rows.file_rows = self.file_rows
         rows.update((name, column[chosen]) for name, column in self.items())
         return rows
 

@@ -149,8 +149,10 @@ class Layout:
         """Return the block ``name`` that ``node`` (id) owns or that all share, None without one."""
         return self._by_key.get((name, node), self._by_key.get((name, None)))
 
-    def require(self, name: object, node: int) -> Place:
-        """Return the block ``name`` of ``node``; raises ScenarioError without one."""
+    def require(self, name: object, node: int, whose: str = "") -> Place:
+        """Return the block ``name`` of ``node``, which messages call ``whose``; raises
+        ScenarioError without one.
+        """
         if name not in self.names:
             listed = ", ".join(f'"{one}"' for one in self.names)
             remedy = f"{suggest_nearest(name, self.names)}names are {listed}"
@@ -158,7 +160,7 @@ class Layout:
         place = self.find(str(name), node)
         if place is None:
             owners = [one.node for one in self.places if one.name == name]
-            rule = f"must be a block that node {node} has"
+            rule = f"must be a block that {whose or f'node {node}'} has"
             raise ScenarioError("", rule, name, f"nodes with it are {', '.join(map(str, owners))}")
         return place
 
@@ -400,8 +402,8 @@ def _check_shapes(k: int, block: Block) -> None:
         shape = (n, value.shape[-1]) if is_wide else shapes[name]
         if value is not None and value.shape != shape:
             wanted, actual = (" x ".join(map(str, one)) for one in (shape, value.shape))
-            why = f"because the state has {n} components"
-            rule = f"must be {wanted}, not {actual}, {why}"
+            source = ("F" if is_slotted else "A") if plant.linear else ("Q" if is_slotted else "B")
+            rule = f"must be {wanted}, not {actual}, because {source} has {n} rows"
             raise ScenarioError(f"[{k}].{key}", rule, value, "correct the shape")
 
 

@@ -202,18 +202,23 @@ class RecordedInput(Input):
         return columns, np.stack([columns[name] for name in names], axis=1)
 
     @property
+    def columns(self) -> Columns:
+        """The columns of the rows that count."""
+        return self._table[0]
+
+    @property
     def row_keys(self) -> list[float]:
         """The instant of each row that counts, in the order of the table."""
-        return [float(t) for t in self.time_grid.snap(self._table[0]["t"])]
+        return [float(t) for t in self.time_grid.snap(self.columns["t"])]
 
     @cached_property
     def exogenous(self) -> Exogenous:
         """The system whose output is u, which jumps at the rows; raises ScenarioError for two
         values at one time.
         """
-        columns, u = self._table
+        u = self._table[1]
         rule = "there may be one row a time, or equal ones"
-        first = first_rows(columns, self.row_keys, u.tolist(), rule)
+        first = first_rows(self.columns, self.row_keys, u.tolist(), rule)
         times = np.array(sorted(first))[self._begun :]
         z, m = u[[first[t] for t in times.tolist()]], u.shape[1]
         return Exogenous(np.maximum(times, 0.0), np.zeros((m, m)), np.eye(m), z)

@@ -162,7 +162,7 @@ def _check_motion(plant: Any, motion: Any) -> None:
         raise ScenarioError("input", f'means nothing with "{plant.f}"', None, "leave it out")
     rule = f'must have {motion.m} components for "{plant.f}", {motion.inputs}'
     got = f"{m} components" if m else None
-    remedy = 'give [plant.input], such as kind = "constant" and value = [v, w]'
+    remedy = 'write input = { kind = "constant", value = [v, w] }'
     raise ScenarioError("input", rule if m else f"is missing: it {rule}", got, remedy)
 
 

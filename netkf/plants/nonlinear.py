@@ -368,7 +368,10 @@ class PositionedSensor(NonlinearSensor):
             which = f"anchor in {self.record.path.name}: {', '.join(map(str, places))}"
         if not isinstance(self.positions, str) and shape != (len(places), len(self.states)):
             rule = f"must be {len(places)} rows of {len(self.states)}, one for each {which}"
-            raise ScenarioError("positions", rule, f"{shape[0]} x {shape[1]}", "add or remove some")
+            remedy = "add or remove some"
+            if self.record is not None and not self.record.has_anchors:
+                remedy += f", or name what was seen in a column to of {self.record.path.name}"
+            raise ScenarioError("positions", rule, f"{shape[0]} x {shape[1]}", remedy)
         if self.R.shape != (self.rows, self.rows):
             rule = f"must be {self.rows} x {self.rows}"
             raise ScenarioError("R", rule, self.R, "correct the shape")

@@ -67,15 +67,20 @@ def forgetting(scenario: Scenario) -> str:
 
 def mismatch_note(scenario: Scenario) -> str:
     """Return a note on P and its bound if the filters' model may not be the truth, or empty."""
-    if scenario.departures:
-        return "; ".join(evidence for _, evidence in scenario.departures)
-    if not scenario.is_linear:
-        names = {"dynamics": scenario.plant.linear, "readings": scenario.has_linear_sensors}
+    reasons = [evidence for _, evidence in scenario.departures]
+    names = {"dynamics": scenario.plant.linear, "readings": scenario.has_linear_sensors}
+    if not all(names.values()):
         parts = " and ".join(name for name, is_linear in names.items() if not is_linear)
-        return (
+        reasons.append(
             f"{parts} are not linear: filters linearise them at their own estimates, and P need "
             "not be, or bound, the covariance of the error"
         )
+    reasons.append(_model_note(scenario))
+    return "; ".join(filter(None, reasons))
+
+
+def _model_note(scenario: Scenario) -> str:
+    """Return how what filters know differs from the truth, or empty."""
     if scenario.filters_know_the_truth:
         return "; ".join(filter(None, (start_note(scenario), forgetting(scenario))))
     if not scenario.is_random:

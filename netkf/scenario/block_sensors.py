@@ -11,6 +11,7 @@ import numpy as np
 from netkf.core.errors import ScenarioError, errors_under, suggest_nearest
 from netkf.core.places import Place
 from netkf.core.printable import list_some
+from netkf.core.repeated_rows import first_rows
 from netkf.network.graphs import Topology
 from netkf.plants.blocks import Layout
 from netkf.plants.nonlinear import PositionedSensor
@@ -141,7 +142,11 @@ def _of_blocks(sensor: Any, layout: Layout, topology: Topology) -> Iterator[Any]
     nodes: dict[Place, list[int]] = {}
     for node in sensor.nodes:
         with errors_under("of"):
-            nodes.setdefault(layout.require(name, node), []).append(node)
+            whose = f"node {node}"
+            if sensor.record is not None and node in sensor.record.nodes:
+                row = sensor.record.nodes.index(node)
+                whose += f" of {sensor.record.columns.where(row)}"
+            nodes.setdefault(layout.require(name, node, whose), []).append(node)
     for place, readers in nodes.items():
         yield _for_block(sensor, place, tuple(readers), layout)
 
@@ -164,7 +169,7 @@ def _name_of(sensor: Any, layout: Layout) -> str | None:
 def _for_block(sensor: Any, place: Place, nodes: tuple[int, ...], layout: Layout) -> Any:
     """Return a sensor of a block as one of the stacked state, on ``nodes`` alone."""
     if isinstance(sensor, PositionedSensor):
-        if max(*sensor.states, sensor.heading or 0) >= place.n:
+        if max(sensor.states) >= place.n:
             rule = f"must be components of block {place.name!r}, which has {place.n}"
             raise ScenarioError("states", rule, list(sensor.states), "they count from 0")
         sensor.check_state(place.n)
@@ -196,35 +201,38 @@ def _pairs(sensor: Any, layout: Layout, topology: Topology) -> Iterator[tuple[Pl
             raise ScenarioError("of", "is missing, the block that is read", None, remedy)
         name = next(iter(owned))
     owners = {p.node: p for p in layout.places if p.name == name and p.node is not None}
-    for key, reader, other in _targets(sensor, topology, list(owners)):
+    for key, where, reader, other in _targets(sensor, topology, list(owners)):
         for node in (reader, other):
             if node not in owners:
-                rule = f"must be nodes with a block {name!r} of their own"
+                rule = f"{where}must be nodes with a block {name!r} of their own"
                 remedy = f"nodes with it are {', '.join(map(str, owners))}"
                 raise ScenarioError(key, rule, node, remedy)
         if reader == other:
-            raise ScenarioError(key, "must be two nodes", reader, "correct the pair")
+            raise ScenarioError(key, f"{where}must be two nodes", reader, "correct the pair")
         yield owners[reader], owners[other]
 
 
 def _targets(
     sensor: Any, topology: Topology, owners: Sequence[int]
-) -> Iterator[tuple[str, int, int]]:
+) -> Iterator[tuple[str, str, int, int]]:
+    """Yield the key that names a pair, the line of a table that does, and the pair."""
     if sensor.record is not None:
         table = sensor.record
-        pairs = dict.fromkeys(zip(table.nodes, table.columns.integers("to"), strict=True))
-        yield from (("path", i, j) for i, j in pairs if i in sensor.nodes)
+        pairs = zip(table.nodes, table.columns.integers("to"), strict=True)
+        for (i, j), row in first_rows(table.columns, pairs).items():
+            if i in sensor.nodes:
+                yield "path", f"{table.columns.where(row)}: ", i, j
         return
     if not isinstance(sensor.to, str):
         for k, (i, j) in enumerate(sensor.to):
             if sensor.nodes is not None and i not in sensor.nodes:
                 rule = "must begin with one of the nodes of this sensor"
                 raise ScenarioError(f"to[{k}]", rule, i, "add it to nodes, or leave nodes out")
-            yield f"to[{k}]", i, j
+            yield f"to[{k}]", "", i, j
         return
     linked: dict[int, set[int]] = {}
     for i, j in topology.links:
         linked.setdefault(i, set()).add(j)
         linked.setdefault(j, set()).add(i)
     for i in owners if sensor.nodes is None else sensor.nodes:
-        yield from (("to", i, j) for j in sorted(linked.get(i, set()) & set(owners)))
+        yield from (("to", "", i, j) for j in sorted(linked.get(i, set()) & set(owners)))

@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from netkf.core.csv_files import Columns
 from netkf.core.errors import ScenarioError, errors_under
+from netkf.core.fields import SourceFile
 from netkf.core.places import Place
 from netkf.core.printable import list_some
 from netkf.core.repeated_rows import RowUse, add_uses, count_rows
@@ -156,7 +158,11 @@ def count_state_rows(scenario: DerivedScenario) -> dict[str, RowUse]:
     if scenario.plant.record is None:
         return {}
     return _sum_by_key(
-        (key, plant.record.use(_state_times(scenario, place).tolist()))
+        (
+            key,
+            plant.record.columns,
+            plant.record.use(_state_times(scenario, place).tolist()),
+        )
         for (key, plant), place in zip(scenario.all_plants, scenario.layout.places, strict=True)
         if plant.record is not None
     )
@@ -170,7 +176,11 @@ def count_input_rows(scenario: DerivedScenario) -> dict[str, RowUse]:
         period = scenario.slot_plant.period
         starts = scenario.time_grid.before(horizon, period * np.arange(int(horizon / period) + 2))
     return _sum_by_key(
-        (key, count_rows(u.path.name, u.row_keys, u.used_keys(horizon, starts).__contains__))
+        (
+            key,
+            u.columns,
+            count_rows(u.path.name, u.row_keys, u.used_keys(horizon, starts).__contains__),
+        )
         for key, u in _recorded_inputs(scenario)
     )
 
@@ -178,12 +188,15 @@ def count_input_rows(scenario: DerivedScenario) -> dict[str, RowUse]:
 def count_plant_rows(scenario: DerivedScenario) -> dict[str, RowUse]:
     """Return the use of the rows of recorded states and inputs if all are used, by key path."""
     tables = [
-        (key, plant.record.columns.source.name, plant.record.row_keys)
+        (key, plant.record.columns, plant.record.row_keys)
         for key, plant in scenario.all_plants
         if plant.record is not None
     ]
-    tables += [(key, u.path.name, u.row_keys) for key, u in _recorded_inputs(scenario)]
-    return _sum_by_key((key, count_rows(path, keys, lambda _: True)) for key, path, keys in tables)
+    tables += [(key, u.columns, u.row_keys) for key, u in _recorded_inputs(scenario)]
+    return _sum_by_key(
+        (key, columns, count_rows(columns.source.name, keys, lambda _: True))
+        for key, columns, keys in tables
+    )
 
 
 def _recorded_inputs(scenario: Any) -> Iterator[tuple[str, RecordedInput]]:
@@ -192,10 +205,19 @@ def _recorded_inputs(scenario: Any) -> Iterator[tuple[str, RecordedInput]]:
             yield f"{key}.input", plant.input.on_grid(scenario.time_grid)
 
 
-def _sum_by_key(uses: Iterable[tuple[str, RowUse]]) -> dict[str, RowUse]:
+def _sum_by_key(uses: Iterable[tuple[str, Columns, RowUse]]) -> dict[str, RowUse]:
+    """Return the use of tables by the keys that name them; rows of nodes that no block belongs to
+    are unused under the first key.
+    """
     by_key: dict[str, list[RowUse]] = {}
-    for key, use in uses:
+    parts: dict[SourceFile, list[tuple[str, Columns]]] = {}
+    for key, columns, use in uses:
         by_key.setdefault(key, []).append(use)
+        parts.setdefault(columns.source, []).append((key, columns))
+    for source, owners in parts.items():
+        key, columns = owners[0]
+        taken = np.unique(np.concatenate([own.lines for _, own in owners]))
+        by_key[key].append(RowUse(source.name, columns.file_rows - len(taken), 0, 0))
     return {key: add_uses(parts) for key, parts in by_key.items()}
 
 

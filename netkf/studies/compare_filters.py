@@ -76,6 +76,7 @@ class ComparedFilter:
                     error of any node at any sample), and the other quantities of samples of
                     summaries; empty if it cannot run
     consistency   : "consistent", "overconfident" or "conservative", by NEES / n, "-" where unknown
+                    or of recorded states or readings
     traffic       : the quantities of the network in summaries, of replica 0: transmissions (a
                     broadcast counts once), bytes, ages, ...; empty if it cannot run
     status        : "complete", how many runs diverged, or why it cannot run there
@@ -268,7 +269,8 @@ def _make_row(
     return ComparedFilter(
         entry.label,
         estimate_quantities(own.values, base, n, sample_names(scenario), level),
-        credibility(own.values, n, level),
+        # All runs have one and the same record: NEES differs from n by that as well as by P.
+        credibility(own.values, n, level) if own.scenario.is_random else "-",
         own.traffic,
         f"{diverged} of {runs} runs diverged" if diverged else "complete",
         predicts=own.scenario.slotted and own.scenario.node_filter.timing.predicts,

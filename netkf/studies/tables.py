@@ -167,6 +167,10 @@ def _filter_legend(
         "by run, +- half of their intervals; *: 0 is outside, all marks together at confidence "
         f"{comparison.confidence:g}"
     )
+    if comparison.runs > 1 and any(
+        row.consistency == "-" and math.isfinite(row.quantities["nees_ratio"].value) for row in ran
+    ):
+        lines.append("consistency: -, where all runs have the one state or readings of a record")
     lines.append("worst instant: largest error of any node at any sample; traffic of replica 0")
     if has_ages:
         lines.append("age: of the newest reading of each sensor, mean over time and nodes, s")

@@ -352,6 +352,7 @@ def test_mistakes_in_blocks_are_refused_in_one_line(scenario, key, value, words)
     [
         ("positions", [[0.0, 1.0]], "positions: must be 2 rows of 2, one for each of nodes"),
         ("heading", 2, "heading: must be a component of a state of 3, and means nothing"),
+        ("heading", 3, "heading: must be a component of a state of 3, and means nothing"),
         ("R", [[1.0, 0.0], [0.0, 1.0]], "R: must be 1 x 1"),
         ("states", [0, 3], "states: must be components of block 'pose', which has 3"),
     ],

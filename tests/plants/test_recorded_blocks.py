@@ -124,9 +124,11 @@ def test_recorded_states_of_blocks_count_whole_turns(tmp_path, time, engine):
     assert abs(run.x[-1] - run.xhat[-1, 0])[:3].max() < 0.5
     assert scenario.notes == ()
     uses = record_usage(scenario, sent=None)
+    # The row of a node without a block counts once, where the table is named first.
     assert {key: use["unused"] for key, use in uses.items()} == {
-        "plants[0]": 0, "plants[1]": 0, "plants[0].input": 1, "plants[1].input": 0,
+        "plants[0]": 0, "plants[1]": 0, "plants[0].input": 2, "plants[1].input": 0,
     }  # fmt: skip
+    assert uses["plants[0].input"]["rows"] + uses["plants[1].input"]["rows"] == 5
 
 
 def test_recorded_linear_blocks_are_one_recorded_plant(tmp_path):
@@ -167,6 +169,36 @@ def test_tables_by_node_are_refused_where_they_do_not_fit(tmp_path, change, mess
     scenario = from_table(table, tmp_path)
     with pytest.raises(ScenarioError, match=message):
         scenario.replace(change)
+
+
+@pytest.mark.parametrize(
+    ("kind", "rows", "message"),
+    [
+        (
+            "relative-range",
+            "1,1,2,5\n2,1,7,5\n",
+            r"sensors\[0\].path: seen.csv line 3: must be nod",
+        ),
+        (
+            "relative-range",
+            "1,1,2,5\n2,1,1,5\n",
+            r"path: seen.csv line 3: must be two nodes; got 1",
+        ),
+        ("range", "1,1,9,5\n2,7,9,5\n", r"of: must be a block that node 7 of seen.csv line 3 has"),
+        ("range", "1,1,9,5\n", r"must be 1 rows of 2.*; got '2 x 2'; add or remove some$"),
+    ],
+)
+def test_a_row_of_a_node_without_a_block_is_refused_with_its_line(tmp_path, kind, rows, message):
+    table = team(tmp_path, FLOW, input=RECORDED)
+    (tmp_path / "seen.csv").write_text(f"t,node,to,y0\n{rows}")
+    places = {"positions": [[0.0, 1.0]] * 2} if kind == "range" else {}
+    table["sensors"] = [{"kind": kind, "of": "pose", "path": "seen.csv", "R": [[1.0]], **places}]
+    with pytest.raises(ScenarioError, match=message):
+        from_table(table, tmp_path)
+    (tmp_path / "seen.csv").write_text("t,node,seen,y0\n1,1,4,5\n")
+    if kind == "range":
+        with pytest.raises(ScenarioError, match="name what was seen in a column to of seen"):
+            from_table(table, tmp_path)
 
 
 def test_a_plant_of_all_has_no_rows_by_node(tmp_path):

@@ -11,7 +11,10 @@ import scipy.stats
 import netkf
 from netkf import parts
 from netkf.cli.main import main
+from netkf.scenario.reading import from_table
+from netkf.scenario.tables import as_table
 from netkf.studies.compare_filters import write_comparison
+from netkf.studies.tables import format_filters
 from tests.conftest import SCENARIOS
 
 RUNS = 6
@@ -246,3 +249,21 @@ def test_the_networks_of_the_benchmark_run(file):
     ages = run.events.loc[run.events["kind"] == "deliver", "age"]
     assert (ages.max() > 0.1) == (file.stem == "one_way")
     assert np.isfinite(run.P).all()
+
+
+def test_one_record_is_no_test_of_P(scenario, tmp_path):
+    """Runs that differ by losses alone have one error of the plant: no spread tells of P."""
+    rows = "".join(f"{k},{3 * k},0\n" for k in range(10))
+    (tmp_path / "truth.csv").write_text(f"t,x0,x1\n{rows}")
+    table = as_table(scenario)
+    table["plant"] |= {"kind": "recorded", "path": "truth.csv"}
+    recorded = from_table(table, tmp_path).replace({"sensors.0.R": [[1e-9]]})
+    drawn = recorded.replace({"plant": as_table(scenario)["plant"]})
+    verdicts = [
+        [row.consistency for row in netkf.compare_filters(one, ["local"], runs=5, workers=1).rows]
+        for one in (recorded, drawn)
+    ]
+    assert verdicts[0] == ["-"]
+    assert verdicts[1] != ["-"]
+    text = format_filters(netkf.compare_filters(recorded, ["central"], runs=2, workers=1))
+    assert "consistency: -, where all runs have the one state or readings of a record" in text

@@ -110,6 +110,10 @@ def test_no_filter_is_cautious_by_design_that_starts_too_sure(key, value, words,
     changed = ring.replace({key: value})
     assert covariance_bias(changed) == ""
     assert words in mismatch_note(changed)
+    # One cause does not hide another.
+    gated = changed.replace({"filter.gate": {"probability": 0.99, "then": "ignore"}})
+    assert words in mismatch_note(gated)
+    assert "a gate refuses" in mismatch_note(gated)
 
 
 def test_a_mismatched_model_is_as_bad_as_theory_says(gossip):
