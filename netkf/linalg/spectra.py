@@ -101,7 +101,7 @@ def hidden_mode(A: FloatArray, C: FloatArray, border: Border | None = None) -> c
         # The mode is hidden if A - value I and C have a common null vector.
         pencil = np.concatenate([balanced - value * np.eye(n), outputs * (size / largest)])
         if np.linalg.svd(pencil, compute_uv=False)[-1] < HIDDEN * size:
-            return value
+            return value if value.imag else value.real + 0.0  # -0.0 is 0
     return None
 
 

@@ -31,6 +31,7 @@ from netkf.trace.schema import KINDS
 MAX_ERRORS = 24
 """Largest number of errors of all nodes whose exact covariance costs about a few runs."""
 Batches = TypeVar("Batches", bound=tuple[Any, ...])
+SAME = 1e-9  # of the largest state: a larger difference is more than rounding
 NO_QUANTITIES = np.empty((0, 0))
 
 
@@ -119,6 +120,16 @@ class MeanEstimate(NamedTuple):
 
     value: float
     error: float
+
+
+def is_one_truth(x: FloatArray, other: FloatArray) -> bool:
+    """Return True if true states (K, n) are equal up to rounding, which an input that filters do
+    not know moves.
+    """
+    scale = np.fmax.reduce(np.abs(x), axis=1, keepdims=True, initial=0.0)
+    with np.errstate(invalid="ignore"):  # of infinite states, which are equal
+        close = (x == other) | (np.abs(x - other) <= SAME * scale) | (np.isnan(x) & np.isnan(other))
+    return bool(close.all())
 
 
 def mean_over_runs(values: FloatArray) -> MeanEstimate:

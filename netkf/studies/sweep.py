@@ -36,6 +36,7 @@ from netkf.studies.metrics import (
     block_metrics,
     bound_traces,
     central_traces,
+    is_one_truth,
     join_batches,
     mean_over_runs,
     square_root_of,
@@ -166,11 +167,13 @@ def _make_row(point: GridPoint, metrics: RunMetrics) -> Row:
 
 
 def _same_truth(first: Scenario, other: Scenario) -> bool:
-    times = np.intersect1d(first.times, other.times)[:SHOWN]
+    times = np.intersect1d(first.times, other.times)
     if first is other or not len(times) or not (first.plant.is_random or other.plant.is_random):
         return True
+    # Plants may change at any time of a run.
+    times = times[np.unique(np.linspace(0, len(times) - 1, SHOWN).astype(int))]
     x, other_x = (_true_states(scenario, times) for scenario in (first, other))
-    return np.array_equal(x, other_x, equal_nan=True)
+    return is_one_truth(x, other_x)
 
 
 def _true_states(scenario: Scenario, times: FloatArray) -> FloatArray:

@@ -6,6 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from netkf.core.printable import count_phrase, shorten
 from netkf.runs.tables import format_number, format_table, format_with_error, shorten_rows
 from netkf.studies.compare import Comparison
@@ -46,6 +48,7 @@ def format_sweep(lines: pd.DataFrame, keys: Sequence[str]) -> str:
 
 def _format_short(value: Any) -> str:
     text = f"{value:g}" if isinstance(value, float) else str(value)
+    text = text.lower() if isinstance(value, (bool, np.bool_)) else text  # as in TOML
     return text if len(text) <= MAX_LENGTH else f"{text[: MAX_LENGTH - 3]}..."
 
 

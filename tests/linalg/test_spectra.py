@@ -93,6 +93,8 @@ def test_sensors_of_very_different_precision_show_modes_alike():
     A = np.zeros((2, 2))
     assert hidden_mode(A, outputs_of(np.diag([1e6, 1e-7]))) is None
     assert hidden_mode(A, outputs_of(np.diag([1e6, 0.0]))) is not None
+    # A real one is printed as one.
+    assert f"{hidden_mode(np.diag([-0.5, 2.0]), np.array([[1.0, 0.0]]), RATE):.6g}" == "2"
     random = np.random.default_rng(5)
     for _ in range(100):
         # One reading of a random direction: the rest of the information matrix is rounding.

@@ -32,7 +32,7 @@ from netkf.studies.metrics import (
 from netkf.studies.parameter_grid import parse_grid, parse_interval, table_column
 from netkf.studies.size import size
 from netkf.studies.sweep import plan_sweep, sweep, sweep_to_directory
-from netkf.studies.tables import format_answer
+from netkf.studies.tables import format_answer, format_sweep
 from netkf.studies.targets import Target, parse_target, quantity_by_simulation
 from tests.conftest import SCENARIOS
 
@@ -272,18 +272,23 @@ POISSON = {"kind": "poisson", "rate": 2.0}
         ("sensors.0.nodes", [[0], [0, 1]], ()),
         ("horizon", [4.0, 3.0], ()),
         ("plant.B", [[[1.0]], [[2.0]], [[1.5]]], (1, 2)),
+        ("plant.schedule", [[{"from": t, "A": [[-2.0]]}] for t in (30.0, 25.0, 39.0)], (1, 2)),
+        ("filter.model.input", [True, False], ()),
         ("sensors.0.sampling", [POISSON, "continuous"], (1,)),
     ],
 )
 def test_sweeps_meet_one_truth_or_say_another(key, values, moved):
     """Rows keep their truth whatever is sampled; what moves it is marked in the status."""
     scenario = from_table(SAMPLED, Path())
+    if key in ("plant.schedule", "filter.model.input"):
+        driven = {"kind": "sine", "G": [[1.0]], "amplitude": 3.0, "frequency": 0.2}
+        scenario = scenario.replace({"horizon": 40.0, "plant.input": driven})
     table = sweep(scenario, {key: values}, workers=1, engine="simpy")
     assert [k for k, status in enumerate(table.status) if "another truth" in status] == [*moved]
     runs = [netkf.simulate(scenario.replace({key: value}), engine="simpy") for value in values]
     for k, run in enumerate(runs):
         _, here, there = np.intersect1d(runs[0].times, run.times, return_indices=True)
-        assert np.array_equal(runs[0].x[here], run.x[there]) != (k in moved)
+        assert np.allclose(runs[0].x[here], run.x[there], rtol=0, atol=1e-12) != (k in moved)
 
 
 def test_values_of_several_types_share_a_column(tmp_path):
@@ -297,6 +302,11 @@ def test_values_of_several_types_share_a_column(tmp_path):
     assert list(stored["time.origin"]) == ["2020-01-01T00:00:00", "5.0"] * 2
     assert table_column([1, 10**25]) == ["1", f"1{'0' * 25}"]
     assert table_column([True, 2]) == ["true", "2"]
+    flags = sweep(scenario, {"network.channel.symmetric": [True, False]}, engine="simpy")
+    assert [
+        line.split()[0]
+        for line in format_sweep(flags, ("network.channel.symmetric",)).split("\n")[2:]
+    ] == ["true", "false"]
 
 
 def test_the_centralised_filter_follows_changes_of_the_plant():
