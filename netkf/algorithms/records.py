@@ -8,6 +8,7 @@ node at a time, see ``algorithms.kernels.run``.
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -19,11 +20,10 @@ import numpy as np
 
 from netkf.algorithms.kernels import run as standard
 from netkf.algorithms.kernels.neighbours import combine_convex
+from netkf.core.contracts import kernel_problem
 from netkf.core.errors import quote
 from netkf.linalg.arrays import FloatArray, IntArray
-from netkf.linalg.compiling import Kernel
 from netkf.linalg.lanes import aligned
-from netkf.linalg.plain import is_plain
 from netkf.linalg.structs import Struct, StructClass
 
 Shapes = Mapping[str, Any]
@@ -194,12 +194,13 @@ class Kernels:
     depends_on_data: bool | None = None
 
     def __post_init__(self) -> None:
-        """Raise TypeError for a verb that is no kernel."""
+        """Raise TypeError for a verb that is no kernel, or takes other arguments."""
         for name in VERBS:
             verb = getattr(self, name)
-            if not (isinstance(verb, Kernel) or (is_plain() and callable(verb))):
-                rule = "must be a kernel (netkf.kernels.kernel)"
-                raise TypeError(f"Kernels.{name} {rule}, not {quote(verb)}")
+            due = getattr(type(self), name)
+            names = inspect.signature(inspect.unwrap(getattr(due, "loops", due))).parameters
+            if problem := kernel_problem(verb, [*names]):
+                raise TypeError(f"Kernels.{name} {problem}")
 
     def record_of(self, filtering: Any, infos: Sequence[Any], models: Sequence[Any]) -> Record:
         """Return what ``record`` makes; raises TypeError if it is no Record."""

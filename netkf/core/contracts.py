@@ -25,6 +25,13 @@ from typing import Any, NamedTuple
 from weakref import WeakSet
 
 from netkf.core.errors import quote
+from netkf.linalg.compiling import Kernel
+from netkf.linalg.plain import is_plain
+
+_PLACE = re.compile(r'File "([^"]+)", line (\d+)|(?:at|from) (\S+) \((\d+)\)')
+"""Where an error of numba says that it was, from the inside to the outside."""
+_FRAME = re.compile(r"Failed in|During:|File |- Resolution|Use of unsupported opcode")
+"""How lines of an error of numba begin that do not say what is wrong."""
 
 
 class ContractError(TypeError):
@@ -63,7 +70,11 @@ def source_line(code: CodeType, line: int | None = None) -> str:
     """Return "file, line n" of a function's ``code``, or of a ``line`` in it: the path is relative
     where the file is below the current folder.
     """
-    file, line = code.co_filename, code.co_firstlineno if line is None else line
+    return file_line(code.co_filename, code.co_firstlineno if line is None else line)
+
+
+def file_line(file: str, line: int) -> str:
+    """Return "file, line n", with a relative path where the file is below the current folder."""
     try:
         relative = os.path.relpath(file)
     except (OSError, ValueError):
@@ -76,18 +87,65 @@ def error_line(error: BaseException, package: str = "") -> str:
     is none: neither netkf's files count, nor those of Python and of installed packages, except the
     ``package`` of the user's class.
     """
-    ours, python = str(Path(__file__).parents[1]), os.path.dirname(os.__file__)
     packages = {package} - {"", "netkf"}
     places = [
         source_line(frame.f_code, line)
         for frame, line in traceback.walk_tb(error.__traceback__)
         if str(frame.f_globals.get("__name__")).partition(".")[0] in packages
-        or (
-            not frame.f_code.co_filename.startswith(("<", ours, python))
-            and "site-packages" not in frame.f_code.co_filename
-        )
+        or is_users_file(frame.f_code.co_filename)
     ]
     return places[-1] if places else ""
+
+
+def is_users_file(file: str) -> bool:
+    """Return True for a file that is neither netkf's, Python's nor an installed package's."""
+    ours, python = str(Path(__file__).parents[1]), os.path.dirname(os.__file__)
+    path = file if file.startswith("<") else os.path.abspath(file)  # numba writes relative ones
+    return not path.startswith(("<", ours, python)) and "site-packages" not in path
+
+
+def describe_error(error: BaseException) -> str:
+    """Return the type and text of an exception on one line of at most 300 characters."""
+    if is_of_compiler(error):
+        return _describe_compilation(error)
+    return " ".join(f"{type(error).__name__}: {error}".split())[:300].rstrip(": ")
+
+
+def is_of_compiler(error: BaseException) -> bool:
+    """Return True for an error of numba, which cannot compile a kernel."""
+    return type(error).__module__.startswith("numba.")
+
+
+def _describe_compilation(error: Any) -> str:
+    """Return what of a user's kernel numba cannot compile, with file and line, on one line."""
+    lines = [line for line in map(str.strip, str(error).splitlines()) if line]
+    said = [line for line in lines if not _FRAME.match(line)] or lines
+    text = f"{said[0]} {said[1].lstrip('> ')}" if said[0].endswith(":") else said[0]
+    text = re.sub(r"\.[0-9a-f]{16}\b", "", text.partition(" Raised from")[0])  # digests of types
+    places = [(a or b, int(m or n)) for a, m, b, n in _PLACE.findall(str(error))]
+    if (loc := getattr(error, "loc", None)) is not None:
+        places.append((loc.filename, loc.line))
+    where = next((f" ({file_line(*place)})" for place in places if is_users_file(place[0])), "")
+    called = re.search(r"<function (\w+) at", str(error))
+    which = f"the kernel {called[1]}" if called else "a kernel"
+    return (
+        f"{which} cannot be compiled{where}: {text[:200]}; kernels compute with numbers and the "
+        "arrays of their arguments, and call kernels"
+    )
+
+
+def kernel_problem(value: Any, names: Sequence[str]) -> str:
+    """Return what is wrong with a ``value`` that should be a kernel with arguments of these
+    ``names``, "" if nothing is.
+    """
+    if not (isinstance(value, Kernel) or (is_plain() and callable(value))):
+        return f"must be a kernel (netkf.kernels.kernel), not {quote(value)}"
+    loops = inspect.unwrap(getattr(value, "loops", value))
+    given = [*inspect.signature(loops).parameters]
+    if len(given) == len(names):
+        return ""
+    takes = f"must take ({', '.join(names)}), not ({', '.join(given)})"
+    return f"{takes} ({source_line(loops.__code__)})"
 
 
 def describe_method(cls: type, function: FunctionType) -> str:

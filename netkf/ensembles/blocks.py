@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from netkf.core.contracts import describe_error
 from netkf.core.errors import EngineError
 from netkf.ensembles.merge_tree import Merge, MergeTree
 from netkf.linalg.compiling import seconds_spent
@@ -17,7 +18,6 @@ from netkf.runs.failures import explain_failure
 from netkf.runs.provenance import versions
 from netkf.scenario.imports import unload_namesake
 from netkf.scenario.plugins import (
-    describe_error,
     find_unimportable_class,
     unguarded_line,
     user_components,

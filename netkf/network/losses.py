@@ -15,6 +15,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from netkf.core.contracts import kernel_problem
 from netkf.core.csv_files import Columns, read_columns
 from netkf.core.errors import ScenarioError, quote
 from netkf.core.fields import (
@@ -34,9 +35,8 @@ from netkf.core.fields import (
 from netkf.core.laws import Chain
 from netkf.core.repeated_rows import RowUse, count_rows, first_rows
 from netkf.linalg.arrays import FloatArray
-from netkf.linalg.compiling import Kernel, kernel
+from netkf.linalg.compiling import kernel
 from netkf.linalg.functions import call_function
-from netkf.linalg.plain import is_plain
 from netkf.linalg.vector_functions import VectorFunction
 from netkf.network.graphs import Link, Topology, demand_links
 
@@ -517,8 +517,9 @@ class KernelLoss(Loss):
     def _function(self) -> tuple[VectorFunction, FloatArray]:
         law, settings = inspect.getattr_static(type(self), "law", None), self.settings
         law = getattr(law, "__func__", law)
-        if not (isinstance(law, Kernel) or (is_plain() and callable(law))):
-            raise TypeError(f"{type(self).__name__}.law must be a kernel (netkf.kernels.kernel)")
+        if problem := kernel_problem(law, ("message", "settings", "t", "out")):
+            rule = f"{type(self).__name__}.law {problem}"
+            raise ScenarioError("network.channel.loss", rule, None, "correct the class")
         shapes = (len(MESSAGE),), settings.shape, (1,)
         return VectorFunction(law, shapes, is_kernel=True), settings
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.core.contracts import error_line
+from netkf.core.contracts import error_line, kernel_problem
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import Component, Rule
 from netkf.linalg.arrays import FloatArray, block_diagonal
@@ -193,7 +193,15 @@ def _convert(value: Any) -> Any:
         place = error_line(error)
         rule = f"could not be made ({type(error).__name__}: {error}{'; ' if place else ''}{place})"
         raise ScenarioError("", rule, name, "give it an __init__ without arguments") from error
-    wanted = () if hasattr(part, "kernels") else ("f", "jacobian")
+    if hasattr(part, "kernels"):
+        pair, remedy = part.kernels, "write kernels = (f, jacobian)"
+        if not isinstance(pair, tuple) or len(pair) != 2:
+            raise ScenarioError("", "must have a pair of kernels", name, remedy)
+        for method, function in zip(("f", "jacobian"), pair, strict=True):
+            if problem := kernel_problem(function, ("x", "u", "t", "out")):
+                raise ScenarioError("", f"its kernel {method} {problem}", name, remedy)
+        return CustomDynamics(name, part)
+    wanted = ("f", "jacobian")
     for method in wanted:
         if not callable(getattr(part, method, None)):
             rule = f"must have a method {method}(x, u, t)"

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from netkf.core.contracts import error_line
+from netkf.core.contracts import describe_error, error_line
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import boolean, covariance, field, seconds
 from netkf.linalg.arrays import FloatArray
@@ -140,7 +140,7 @@ def _check_dynamics(plant: Any, functions: tuple[VectorFunction, VectorFunction]
             value = function(x, u, 0.0, 0.0)
         except Exception as error:
             place = error_line(error)
-            rule = f"{name} failed at plant.mean ({type(error).__name__}: {error}"
+            rule = f"{name} failed at plant.mean ({describe_error(error)}"
             rule = " ".join(f"{rule}{'; ' if place else ''}{place})".split())
             remedy = f"{name}(x, u, t) takes x ({n},), u ({m},) and t in seconds"
             raise ScenarioError("f", rule, plant.f, remedy) from error

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from netkf.core.contracts import describe_error
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import as_path, integer
 from netkf.core.instants import TimeGrid
@@ -34,7 +35,6 @@ from netkf.runs.summary import (
     summarise,
 )
 from netkf.runs.transmissions import SentPerLink
-from netkf.scenario.plugins import describe_error
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.usage import record_usage
 from netkf.trace.recorder import Fingerprint, Recorder, Sink

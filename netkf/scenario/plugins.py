@@ -13,7 +13,15 @@ from pathlib import Path
 from types import CodeType, FrameType, FunctionType
 from typing import Any
 
-from netkf.core.contracts import ContractError, error_line, is_netkf_class, last_call, source_line
+from netkf.core.contracts import (
+    ContractError,
+    describe_error,
+    error_line,
+    is_netkf_class,
+    is_of_compiler,
+    last_call,
+    source_line,
+)
 from netkf.core.errors import NetkfError, quote
 from netkf.core.fields import Component, walk
 from netkf.plants.dynamics import CustomDynamics
@@ -115,7 +123,11 @@ def explain_user_error(scenario: Any, error: Exception) -> str | None:
     if isinstance(error, ContractError):
         return f"{_name_of(type(components[0]))}: {error}"
     call = last_call()
-    if call is None or not any(isinstance(part, call.cls) for part in components):
+    if (
+        is_of_compiler(error)
+        or call is None
+        or not any(isinstance(part, call.cls) for part in components)
+    ):
         return f"{_name_of(type(components[0]))} failed: {text}"
     where = f"{call.function.__name__} ({source_line(call.function.__code__)})"
     return f"{_name_of(call.cls)} failed after {where} returned {quote(call.result)}: {text}"
@@ -167,10 +179,7 @@ def describe_failure(error: BaseException) -> str:
     """Return what an exception of a user's class says, with its file and line, on one line."""
     if isinstance(error, ContractError):
         return str(error)
+    if is_of_compiler(error):
+        return f"failed: {describe_error(error)}"
     place = error_line(error)
     return f"failed with {describe_error(error)}" + (f" ({place})" if place else "")
-
-
-def describe_error(error: BaseException) -> str:
-    """Return the type and text of an exception on one line of at most 300 characters."""
-    return " ".join(f"{type(error).__name__}: {error}".split())[:300].rstrip(": ")

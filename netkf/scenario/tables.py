@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from netkf.algorithms.gates import Gate
-from netkf.core.contracts import ContractError, error_line, is_netkf_class
+from netkf.core.contracts import ContractError, describe_error, error_line, is_netkf_class
 from netkf.core.errors import ScenarioError, errors_under, suggest_nearest
 from netkf.core.fields import Component, SourceFile, integer, source_file, walk
 from netkf.network.channels import Channel
@@ -30,7 +30,7 @@ from netkf.plants.states import state_file
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.imports import Origin, find_class
 from netkf.scenario.model import Belief, Filtering, Metrics, Network
-from netkf.scenario.plugins import describe_error, explain_user_error
+from netkf.scenario.plugins import explain_user_error
 from netkf.scenario.registry import KINDS, SLOTTED, find_kind, list_names_of_kind
 from netkf.scenario.stamps import Time
 from netkf.scenario.writing import as_table, part_as_table

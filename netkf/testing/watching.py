@@ -17,12 +17,12 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from netkf.core.contracts import ContractError
+from netkf.core.contracts import ContractError, describe_error
 from netkf.core.errors import NetkfError, ScenarioError, quote
 from netkf.core.fields import Component, check_values
 from netkf.linalg.arrays import FloatArray
 from netkf.rng.streams import Streams
-from netkf.scenario.plugins import describe_error, describe_failure
+from netkf.scenario.plugins import describe_failure
 
 Leaves = dict[str, Any]
 """Copies of the numbers, texts and arrays in a value, by their paths such as ``.P[0]``."""

@@ -17,6 +17,7 @@ import netkf
 from netkf import parts
 from netkf.cli.main import main
 from netkf.kernels import Kernels, Record, kernel
+from netkf.linalg.plain import is_plain
 from netkf.testing import check_channel, check_clock, check_filter, check_sensor
 
 HEAD = "from dataclasses import dataclass\nimport numpy as np\nfrom netkf.parts import *\n"
@@ -419,6 +420,90 @@ def test_a_kernel_that_raises_is_refused(ring, engine):
         netkf.EngineError, match=r"a kernel must not raise \(.*errors.py, line \d+\)"
     ):
         netkf.simulate(ring.replace({"filter": Raising()}), engine=engine)
+
+
+@kernel
+def misspelled(record, h, run):
+    record.xhat[h, 0, 0] = record.xhta[h, 0, 0]  # a line that the message names
+
+
+@kernel
+def unknown(record, h, run):
+    record.xhat[h, 0, 0] = nowhere  # noqa: F821
+
+
+@kernel
+def texts(record, h, run):
+    record.xhat[h, 0, 0] = len(str(record.xhat[h, 0, 0]) + "x")
+
+
+@kernel
+def shouting(message, settings, t, out):
+    out[0] = loudness  # noqa: F821
+
+
+@kernel
+def short(message, out):
+    out[0] = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Uncompiled(parts.Filter):
+    verb: str = parts.setting(parts.text)
+
+    kernels = property(lambda self: Kernels(absorb=globals()[self.verb]))
+
+
+@dataclass(frozen=True, eq=False)
+class Shouting(parts.KernelLoss):
+    law = shouting
+
+
+@dataclass(frozen=True, eq=False)
+class Short(parts.KernelLoss):
+    law = short
+
+
+class Swing:
+    kernels = (short, short)
+
+
+COMPILED = {
+    "misspelled": r"Unknown attribute 'xhta' of type \w*record;",
+    "unknown": r"NameError: name 'nowhere' is not defined",
+    "texts": r"No implementation of function .*: \S",
+}
+
+
+@pytest.mark.skipif(is_plain(), reason="nothing is compiled")
+@pytest.mark.parametrize("verb", COMPILED)
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_what_cannot_be_compiled_is_told_in_one_line_with_its_place(verb, engine, ring):
+    """The compiler's own text was cut after 300 characters, mostly before the place."""
+    place = r"cannot be compiled \(\S*test_user_errors\.py, line \d+\): "
+    with pytest.raises(netkf.EngineError, match=place + COMPILED[verb]) as caught:
+        netkf.simulate(ring.replace({"filter": Uncompiled(verb)}), engine=engine)
+    assert "\n" not in str(caught.value)
+    if engine == "simpy":
+        with pytest.raises(AssertionError, match=rf"absorb: failed: .* {place}{COMPILED[verb]}"):
+            check_filter(Uncompiled(verb))
+
+
+def test_kernels_must_take_what_they_are_given(ring):
+    with pytest.raises(TypeError, match=r"absorb must take \(record, h, run\), not \(message, out"):
+        Kernels(absorb=short)
+    words = r"loss: Short\.law must take \(message, settings, t, out\), not \(message, out\)"
+    with pytest.raises(netkf.ScenarioError, match=words):
+        netkf.simulate(ring.replace({"network.channel.loss": Short()}), engine="simpy")
+    plant = {"f": Swing, "B": [[1.0]], "step": 0.1}
+    with pytest.raises(netkf.ScenarioError, match=r"kernel f must take \(x, u, t, out\), not"):
+        parts.NonlinearDiffusion(**plant)
+    Swing.kernels = (short,)
+    with pytest.raises(netkf.ScenarioError, match="must have a pair of kernels"):
+        parts.NonlinearDiffusion(**plant)
+    if not is_plain():
+        with pytest.raises(netkf.EngineError, match=r"kernel shouting cannot be .* 'loudness' is"):
+            netkf.simulate(ring.replace({"network.channel.loss": Shouting()}), engine="simpy")
 
 
 def test_a_kernel_that_is_silent_without_saying_so_is_told():
