@@ -59,9 +59,11 @@ def forgetting(scenario: Scenario) -> str:
     """Return what nodes that forget do to P, or empty."""
     if not scenario.forgetful_nodes:
         return ""
+    nodes, listed = scenario.forgetful_nodes, list_some(scenario.forgetful_nodes, 5)
+    who = f"node {listed} begins" if len(nodes) == 1 else f"nodes {listed} begin"
     return (
-        f"node {list_some(scenario.forgetful_nodes, 5)} begins again with the mean and covariance "
-        "of time 0, whatever the state is by then: P may be too small after that"
+        f"{who} again with the mean and covariance of time 0, whatever the state is by then: P may "
+        "be too small after that"
     )
 
 
