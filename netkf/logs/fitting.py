@@ -312,7 +312,8 @@ def run_tests(
     }
     parts = outcomes.by_channel.astype(float)
     if len(parts) > 1:
-        own = np.tile(counts[:, 1] / np.maximum(counts[:, 0], 1.0), (len(parts), 1)).ravel()
+        sent, heard = parts.sum(axis=0).T  # without packets whose channel nobody tells
+        own = np.tile(heard / np.maximum(sent, 1.0), (len(parts), 1)).ravel()
         flat, spreads = parts.reshape(-1, 2), np.tile(spread, len(parts))
         used = _count_uncertain(own[: len(counts)])
         found["channel"] = stats.test_identical(flat, own, spreads, used)

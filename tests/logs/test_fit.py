@@ -378,6 +378,20 @@ def test_channels_of_packets_that_nobody_heard_are_not_invented(tmp_path):
     assert likelihood["hopping"] > likelihood["bernoulli"]
 
 
+def test_channels_that_are_alike_stay_so_where_nobody_hears_many_packets(tmp_path):
+    """What is lost with its channel makes no channel better than the link."""
+    random, rows = np.random.default_rng(25), ["t,src,dst,seq,channel"]
+    for k in range(300):
+        for i in range(3):
+            c = random.integers(3)
+            heard = [j for j in range(3) if j != i and random.random() < 0.4]
+            rows += [f"{k + 0.1 * i + 1:.1f},{i},{j},{k % 64},{c}" for j in heard]
+    (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
+    netkf.import_log(tmp_path / "log.csv", "csv", tmp_path / "out")
+    tests = netkf.fit_log(tmp_path / "out", runs=0).tests.set_index("key")
+    assert tests.loc["channel", "verdict"] == "not rejected"
+
+
 @pytest.mark.parametrize("symmetric", ["false", "true"])
 def test_links_with_bursts_of_their_own(tmp_path, symmetric):
     """The table of chains holds what follows what in the record, and its runs are like the log,
