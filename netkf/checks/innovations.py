@@ -25,6 +25,7 @@ from netkf.algorithms.traits import Analysis, Needs, Timing, Weights
 from netkf.core.errors import NetkfError
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.plants.transitions import Transitions
+from netkf.runs.readings import values_read
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run, first_difference
@@ -251,7 +252,17 @@ def compute_innovations(run: Run, max_events: int = MAX_EVENTS) -> Innovations:
     ]
     recorded.sort(key=lambda one: one.time)
     which = cache(lambda node: _rows_read(scenario, node))
-    components = [_components(one, which(one.node)) for one in recorded]
+    rows = [which(one.node) for one in recorded]
+    # Of values read alike only the instants tell which they are.
+    alike = any(len(set(which(node))) < len(which(node)) for node in {one.node for one in recorded})
+    told = values_read(scenario, run.seed, run.replica) if alike else {}
+    times: Any = np.array([one.time for one in recorded])
+    times = scenario.slot_plant.slots_of(times) if scenario.slotted else times
+    keys = [(one.node, time) for one, time in zip(recorded, times.tolist(), strict=True)]
+    components = [
+        _components(one, of_node, told.get(key, []))
+        for one, of_node, key in zip(recorded, rows, keys, strict=True)
+    ]
     return tabulate(recorded)._replace(components=components)
 
 
@@ -266,10 +277,12 @@ def _rows_read(scenario: Scenario, node: int) -> list[tuple[float, ...]]:
     return [tuple(row[view]) for s in sensors for row in s.matrix_of(scenario.plant.n)]
 
 
-def _components(one: Recorded, rows: list[tuple[float, ...]]) -> np.ndarray | None:
+def _components(one: Recorded, rows: list[tuple[float, ...]], told: list[int]) -> np.ndarray | None:
     found = [] if one.H is None else list(map(tuple, one.H))
     if not found or not set(found) <= set(rows):
         return None
+    if [rows[k] for k in told] == found:
+        return np.array(told)
     return np.arange(len(rows)) if found == rows else np.array(list(map(rows.index, found)))
 
 

@@ -164,6 +164,23 @@ def _instants(
     return slots
 
 
+def values_read(scenario: Scenario, seed: int, replica: int) -> dict[tuple[int, float], list[int]]:
+    """Return which of all values that linear sensors of a node give are read, by node and the time
+    (s) of a sample or the number of a slot.
+    """
+    streams, found = Streams(seed, replica), dict[tuple[int, float], list[int]]()
+    for node, sensors in scenario.placed_sensors.items():
+        first = 0
+        for one in sensors:
+            p = len(scenario.sensors[one.entry].matrix_of(scenario.plant.n))
+            instants = _instants(scenario, streams, node, one, all_slots=True)
+            for k, instant in enumerate(instants.tolist()):
+                rows = first + _components(scenario, node, one, instant, k, p)
+                found.setdefault((node, instant), []).extend(rows.tolist())
+            first += p
+    return found
+
+
 def _components(
     scenario: Scenario, node: int, one: PlacedSensor, instant: Any, k: int, p: int
 ) -> np.ndarray:

@@ -323,7 +323,7 @@ def test_nodes_have_the_names_of_the_scenario(tmp_path):
 @pytest.mark.parametrize("kind", ["central", "local"])
 def test_values_of_a_node_are_told_apart(tmp_path, kind):
     """The central filter takes them one by one, and sensors have times of their own, or rows with
-    missing values: biases do not cancel. A sensor that is bad is that of its node.
+    missing values, or read alike: biases do not cancel. A bad sensor is that of its node.
     """
     clock = WALK["sensors"][0]["sampling"]
     fault = {"kind": "biased", "size": [2.0, -2.0]}
@@ -332,7 +332,8 @@ def test_values_of_a_node_are_told_apart(tmp_path, kind):
         {**pair, "H": [row], "R": [[1.0]], "fault": {**fault, "size": [size]}}
         for row, size in zip(np.eye(2).tolist(), fault["size"], strict=True)
     ]
-    for sensors in ([{**pair, "fault": fault}], apart):
+    alike = [{**one, "H": [[1.0, 0.0]]} for one in apart]
+    for sensors in ([{**pair, "fault": fault}], apart, alike):
         changed = {"horizon": 60.0, "sensors": sensors, "filter": {"kind": kind}}
         (row,) = netkf.innovations(from_table({**NAMED, **changed}, tmp_path)).rows
         assert (row.node, row.label in ("height (m)", "speed (m/s)")) == (1, True)
