@@ -18,12 +18,14 @@ import pandas as pd
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import MAX_MAGNITUDE
-from netkf.core.printable import count_phrase
+from netkf.core.printable import count_phrase, list_some
 from netkf.linalg.arrays import FloatArray
 
 HOLE = 0.5  # seconds without a row of odometry, or of true poses, that a note tells
 SPREAD = 1.4826  # standard deviations of a Gaussian in its median deviation
 LEAST = (0.01, 0.005)  # metres and radians: of readings, so that R is not 0 where they are few
+STRANGE = {"distances (m)": 1.0, "directions (rad)": 0.5}
+"""How far off half of a robot's readings are that are no readings of what it saw."""
 COLUMNS = {
     "Odometry": ("t", "u0", "u1"),
     "Groundtruth": ("t", "x0", "x1", "x2"),
@@ -68,7 +70,7 @@ R = [[{R[0]}, 0.0], [0.0, {R[1]}]]
 """
 NETWORK = """
 [network]      # a robot that has read something tells all others; the log knows of no losses
-graph = {{ kind = "edges", edges = {edges} }}
+graph = {{ kind = "edges", {nodes}edges = {edges} }}
 activation = {{ kind = "readings" }}
 
 [filter]
@@ -97,11 +99,16 @@ def read_mrclam(folder: Path) -> tuple[dict[str, str], tuple[str, ...]]:
     tables = {"odometry.csv": files["Odometry"], "truth.csv": files["Groundtruth"]}
     poses = {node: rows for node, rows in tables["truth.csv"].groupby("node")}  # noqa: C416
     # All poses are known from the last beginning to the first end.
-    origin = max((one["t"].iloc[0] for one in poses.values()), key=float)
-    horizon = int(min(float(one["t"].iloc[-1]) for one in poses.values()) - float(origin))
+    last = max(nodes, key=lambda node: float(poses[node]["t"].iloc[0]))
+    first = min(nodes, key=lambda node: float(poses[node]["t"].iloc[-1]))
+    origin, end = poses[last]["t"].iloc[0], poses[first]["t"].iloc[-1]
+    horizon = int(float(end) - float(origin))
     if horizon < 1:
         rule = "must have true poses of all robots for a second or longer"
-        raise ScenarioError(str(folder), rule, None, "check the files")
+        got = f"robot {last} from {origin} on, robot {first} until {end}"
+        raise ScenarioError(
+            str(folder), rule, got, "check the stamps, or leave a robot's files out"
+        )
     start = np.array([float(origin)])
     means = [np.round(_poses_at(poses[node], start)[0], 6).tolist() for node in nodes]
     log = re.sub(r"[^\w.-]", "_", folder.resolve().name)
@@ -114,11 +121,14 @@ def read_mrclam(folder: Path) -> tuple[dict[str, str], tuple[str, ...]]:
     ):
         if len(rows):
             tables[path] = rows
-            parts.append(SENSOR.format(kind=kind, path=path, R=_noise(rows, poses, points)))
+            R = _noise(path, rows, poses, points, notes)
+            parts.append(SENSOR.format(kind=kind, path=path, R=R))
     if is_mark.any():
         listed = [points[i] for i in sorted(set(readings["to"][is_mark]))]
         parts.insert(2, f"positions = {listed}\n")
-    parts.append(NETWORK.format(edges=[[i, j] for i in nodes for j in nodes if i < j]))
+    edges = [[i, j] for i in nodes for j in nodes if i < j]
+    # Edges name the nodes, if there are any.
+    parts.append(NETWORK.format(edges=edges, nodes="" if edges else f"nodes = {nodes}, "))
     # The numbers stay as they are written in the log.
     texts = {path: _by_time(table).to_csv(index=False) for path, table in tables.items()}
     return {"scenario.toml": "".join(parts), **texts}, tuple(notes)
@@ -138,7 +148,10 @@ def _read(path: Path, columns: Sequence[str]) -> pd.DataFrame:
                     rows[line] = entries
     except (OSError, UnicodeDecodeError) as error:
         rule = f"cannot be read ({getattr(error, 'strerror', None) or error})"
-        raise ScenarioError(str(path), rule, None, "check the folder") from None
+        remedy = "check the folder"
+        if re.fullmatch(r"Robot\d+_Groundtruth.dat", path.name):
+            remedy += ', or write [[plants]] with kind = "unknown" for a log without true poses'
+        raise ScenarioError(str(path), rule, None, remedy) from None
     if not rows and columns is not COLUMNS["Measurement"]:  # a robot may see nothing
         raise ScenarioError(str(path), "has no rows", None, "check the folder")
     return pd.DataFrame.from_dict(rows, orient="index", columns=list(columns))
@@ -212,16 +225,33 @@ def _poses_at(poses: pd.DataFrame, times: FloatArray) -> FloatArray:
 
 
 def _noise(
-    rows: pd.DataFrame, poses: dict[Any, pd.DataFrame], points: dict[int, list[float]]
+    path: str,
+    rows: pd.DataFrame,
+    poses: dict[Any, pd.DataFrame],
+    points: dict[int, list[float]],
+    notes: list[str],
 ) -> list[float]:
-    """Return the variances of the middle half of what readings differ by from true poses."""
-    off = []
+    """Return the variances of the middle half of what readings differ by from true poses; tell of
+    robots whose readings have nothing to do with them.
+    """
+    off: dict[Any, list[FloatArray]] = {}
     for (node, to), own in rows.groupby(["node", "to"]):
         t, distance, angle = _numbers(own, "t", "y0", "y1")
         pose = _poses_at(poses[node], t)
         other = np.array(points[to]) if to in points else _poses_at(poses[to], t)[:, :2]
         d = other - pose[:, :2]
         turn = angle - np.arctan2(d[:, 1], d[:, 0]) + pose[:, 2]
-        off.append([distance - np.hypot(*d.T), (turn + np.pi) % (2.0 * np.pi) - np.pi])
-    spread = SPREAD * np.median(np.abs(np.concatenate(off, axis=1)), axis=1)
+        turn = (turn + np.pi) % (2.0 * np.pi) - np.pi
+        off.setdefault(node, []).append(np.stack([distance - np.hypot(*d.T), turn]))
+    apart = {node: np.concatenate(some, axis=1) for node, some in off.items()}
+    medians = {node: np.median(np.abs(some), axis=1).tolist() for node, some in apart.items()}
+    for k, (what, limit) in enumerate(STRANGE.items()):
+        strange = {node: value[k] for node, value in medians.items() if value[k] > limit}
+        if strange:
+            text = (
+                f"{path}: {what} by robot {list_some(list(strange), 5)} differ from the true poses"
+            )
+            least = f"by {min(strange.values()):.3g} or more in the median"
+            notes.append(f"{text} {least}: check their units, and those of stamps and poses")
+    spread = SPREAD * np.median(np.abs(np.concatenate([*apart.values()], axis=1)), axis=1)
     return [round(max(s, least) ** 2, 6) for s, least in zip(spread.tolist(), LEAST, strict=True)]

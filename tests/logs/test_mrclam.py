@@ -2,6 +2,7 @@
 
 import importlib.util
 import math
+import shutil
 
 import numpy as np
 import pandas as pd
@@ -92,7 +93,12 @@ def test_every_number_is_that_of_the_log(log, tmp_path, capsys):
         ("Robot1_Odometry.dat", "# nothing\n", r"Robot1_Odometry.dat: has no rows"),
         ("Barcodes.dat", "1 5\n2 5\n", r"Barcodes.dat: line 2 repeats a barcode"),
         ("Landmark_Groundtruth.dat", None, r"Landmark_Groundtruth.dat: cannot be read"),
-        ("Robot2_Groundtruth.dat", "200 1 1 1\n", "true poses of all robots for a second"),
+        (
+            "Robot2_Groundtruth.dat",
+            "200 1 1 1\n",
+            "true poses of all robots for a second.*robot 2 from 200 on, robot 1 until 103",
+        ),
+        ("Robot2_Groundtruth.dat", None, 'cannot be read .* kind = "unknown" for a log without'),
     ],
 )
 def test_a_bad_line_is_refused_with_its_file_and_number(log, tmp_path, name, text, message):
@@ -110,6 +116,30 @@ def test_a_robot_may_see_nothing_and_stamps_may_be_written_in_any_way(log, tmp_p
     scenario = netkf.load(tmp_path / "out" / "scenario.toml")
     assert (scenario.horizon, scenario.time.origin) == (3.0, 100)
     assert [one.nodes for one in scenario.declared_sensors] == [(1,), (1,)]
+
+
+def test_a_log_of_one_robot_runs(log, tmp_path):
+    for file in log.glob("Robot2_*"):
+        file.unlink()
+    netkf.import_log(log, "mrclam", tmp_path / "out")
+    assert netkf.simulate(netkf.load(tmp_path / "out" / "scenario.toml")).nodes == (1,)
+
+
+def test_readings_in_other_units_are_told(tmp_path):
+    log = tmp_path / "log"
+    shutil.copytree(SMALL, log)
+    for robot, (far, turned) in {1: (1000.0, 1.0), 2: (1.0, 180.0 / math.pi)}.items():
+        path = log / f"Robot{robot}_Measurement.dat"
+        rows = pd.read_csv(path, comment="#", header=None, sep=r"\s+")
+        rows[2], rows[3] = rows[2] * far, rows[3] * turned
+        rows.to_csv(path, sep=" ", header=False, index=False)
+    _, notes = netkf.import_log(log, "mrclam", tmp_path / "out")
+    told = [note for note in notes if "differ from the true poses by" in note]
+    assert [note[: note.index(" differ")] for note in told] == [
+        f"{file}: {what} by robot {robot}"
+        for file in ("landmarks.csv", "robots.csv")
+        for robot, what in ((1, "distances (m)"), (2, "directions (rad)"))
+    ]
 
 
 def test_nothing_is_overwritten_and_a_log_must_be_one(log, tmp_path, capsys):
