@@ -174,7 +174,9 @@ def _filter_legend(
         row.consistency == "-" and math.isfinite(row.quantities["nees_ratio"].value) for row in ran
     ):
         lines.append("consistency: -, where all runs have the one state or readings of a record")
-    lines.append("worst instant: largest error of any node at any sample; traffic of replica 0")
+    known = any(math.isfinite(row.rms_error.value) for row in ran)
+    what = "largest error" if known else "truth unknown, largest root of trace P"
+    lines.append(f"worst instant: {what} of any node at any sample; traffic of replica 0")
     if has_ages:
         lines.append("age: of the newest reading of each sensor, mean over time and nodes, s")
     predicting = [shorten(row.filter) for row in ran if row.predicts]

@@ -266,4 +266,10 @@ def test_one_record_is_no_test_of_P(scenario, tmp_path):
     assert verdicts[0] == ["-"]
     assert verdicts[1] != ["-"]
     text = format_filters(netkf.compare_filters(recorded, ["central"], runs=2, workers=1))
+    assert "worst instant: largest error of any node" in text
+    unknown = {key: value for key, value in table["plant"].items() if key != "path"}
+    table["plant"] = unknown | {"kind": "unknown"}
+    table["sensors"] = []
+    blind = netkf.compare_filters(from_table(table, tmp_path), ["central"], runs=2, workers=1)
+    assert "worst instant: truth unknown, largest root of trace P of any n" in format_filters(blind)
     assert "consistency: -, where all runs have the one state or readings of a record" in text
