@@ -47,14 +47,16 @@ def theory_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
     except TheoryError as error:
         reason = str(error)
     last = scenario.last_piece
-    steady_note, label = _steady_note(last, reached), limit_label(last)
+    limits = [_trace_or_nan(of, last) for of in (limit_covariance, central_covariance)]
+    notes = [_steady_note(last, reached)]
+    if last is not scenario and np.isfinite(limits).any():
+        notes.append("limits and centralised filter are of the plant after all changes")
     return PromisedTraces(
-        bound=bound,
-        limit=_trace_or_nan(limit_covariance, last),
-        central=_trace_or_nan(central_covariance, last),
+        bound,
+        *limits,
         reason=reason or reason_without_bound(last) or "",
-        limit_label=label if last is scenario else f"{label}, after all changes",
-        notes=(*([steady_note] if steady_note else []), *covariance_notes(scenario)),
+        limit_label=limit_label(last),
+        notes=(*filter(None, notes), *covariance_notes(scenario)),
     )
 
 

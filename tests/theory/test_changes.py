@@ -14,6 +14,7 @@ from netkf.core.errors import TheoryError
 from netkf.theory.one_bit.covariances import bit_covariances
 from netkf.theory.promises import compute_promises, promises_text
 from netkf.theory.stochastic_trigger.errors import expected_sends
+from netkf.theory.traces import limit_label, theory_traces
 from tests.engines.test_changes import (
     INCREMENTS,
     TIMES,
@@ -180,6 +181,11 @@ def test_steady_states_are_those_of_the_last_piece():
     text = promises_text(s, compute_promises(s))
     assert "steady states and limits: of the plant from 4.1 s on" in text
     assert "the plant does not change" in text
+    # Beside a run a note says it, of filters that the hybrid paper is not about too.
+    for one in (s, s.replace({"filter": {"kind": "central"}})):
+        promised = theory_traces(one, one.times)
+        assert "limits and centralised filter are of the plant after all changes" in promised.notes
+        assert promised.limit_label == limit_label(one)
 
 
 def test_the_central_filter_in_slots_is_that_of_the_last_piece():
