@@ -47,16 +47,17 @@ def theory_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
     except TheoryError as error:
         reason = str(error)
     last = scenario.last_piece
-    limits = [_trace_or_nan(of, last) for of in (limit_covariance, central_covariance)]
-    notes = [_steady_note(last, reached)]
-    if last is not scenario and np.isfinite(limits).any():
-        notes.append("limits and centralised filter are of the plant after all changes")
+    limit, central = (_trace_or_nan(of, last) for of in (limit_covariance, central_covariance))
+    remarks = [_steady_note(last, reached)]
+    if last is not scenario and np.isfinite([limit, central]).any():
+        remarks.append("limits and centralised filter are of the plant after all changes")
     return PromisedTraces(
         bound,
-        *limits,
+        limit,
+        central,
         reason=reason or reason_without_bound(last) or "",
         limit_label=limit_label(last),
-        notes=(*filter(None, notes), *covariance_notes(scenario)),
+        notes=(*filter(None, remarks), *covariance_notes(scenario)),
     )
 
 
