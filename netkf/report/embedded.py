@@ -14,6 +14,7 @@ from netkf.ensembles.monte_carlo import Ensemble
 from netkf.report.page import make_page
 from netkf.runs.files import write_text
 from netkf.runs.run import save
+from netkf.scenario.plugins import user_components
 from netkf.trace.run import Run
 
 
@@ -41,21 +42,23 @@ def page(result: Any, other: Any = None, *, replica: int | str | None = None) ->
     """Return the page that ``netkf report`` writes of a result, or of two side by side: each is a
     run or an ensemble in memory, what ``netkf.open`` returns, or a directory. The runs of an
     ensemble in memory are simulated again, with the events of replica 0. ``replica`` is the run of
-    an ensemble to show, its number, "worst" or "median". Scenarios are read without trust, see
-    ``netkf.open``.
+    an ensemble to show, its number, "worst" or "median". Directories are read without trust: give
+    what ``netkf.open(directory, trust=True)`` returns.
 
     Raises ScenarioError for what is no result, EngineError, and WriteError.
     """
     with tempfile.TemporaryDirectory() as folder:
-        directories = []
+        directories, trust = [], []
         for k, one in enumerate([result] if other is None else [result, other]):
+            # Classes of a result in memory have been imported.
+            trust.append(bool(user_components(getattr(one, "scenario", None))))
             directory = getattr(one, "directory", one)
             if directory is one and isinstance(one, Run | Ensemble):
                 directory = _write(one, Path(folder) / f"RUN{k + 1}")
             remedy = "give a run, an ensemble or its directory"
             directories.append(as_path("result", directory, remedy))
         # The command on the page names no folder that is gone.
-        return Page(make_page(directories, replica).replace(f"{folder}/", ""))
+        return Page(make_page(directories, replica, trust).replace(f"{folder}/", ""))
 
 
 def _write(result: Run | Ensemble, directory: Path) -> Path:

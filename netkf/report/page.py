@@ -90,7 +90,7 @@ def write_report(
     path = Path(directories[0]) / "report.html" if out is None else out
     if out is not None or path.parent.is_dir():
         _require_page(path)
-    write_text(path, make_page(directories, replica, trust, path))
+    write_text(path, make_page(directories, replica, (trust, trust), path))
     return path
 
 
@@ -116,19 +116,23 @@ def _require_page(path: Path) -> None:
 def make_page(
     directories: Sequence[str | Path],
     replica: int | str | None = None,
-    trust: bool = False,
+    trust: Sequence[bool] = (False, False),
     out: Path | None = None,
 ) -> str:
-    """Return the page of one or two directories as HTML, see ``write_report``; ``out`` is only
-    named in the command on the page. Raises ScenarioError.
+    """Return the page of one or two directories, of which each has its ``trust``, as HTML, see
+    ``write_report``; ``out`` is only named in the command on the page. Raises ScenarioError.
     """
     if not 1 <= len(directories) <= 2:
         raise ScenarioError("report", "takes one or two directories", len(directories))
-    entries = [_analyse_directory(Path(directory), replica, trust) for directory in directories]
+    # One of two directories may be trusted alone.
+    entries = [
+        _analyse_directory(Path(directory), replica, trusted)
+        for directory, trusted in zip(directories, trust, strict=False)
+    ]
     entries = _merge_verdict(entries)
     command = ["netkf", "report", *map(str, directories)]
     command += ["--replica", str(replica)] if replica is not None else []
-    command += ["--trust"] if trust else []
+    command += ["--trust"] if any(trust) else []
     command += ["--out", str(out)] if out is not None else []
     comparison: Comparison | str | None = None
     if len(entries) > 1:

@@ -56,6 +56,29 @@ def test_the_page_of_an_ensemble_in_memory_is_that_of_the_command(tmp_path, monk
     assert netkf.page("RUN1").html == page.html
 
 
+def test_results_in_memory_have_classes_that_are_imported_and_directories_have_not(
+    tmp_path, monkeypatch
+):
+    """The page of a run with a filter of one's own was refused, and asked for a trust argument."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own_alone.py").write_text(
+        "import netkf.parts\n\nclass Own(netkf.parts.Filter):\n"
+        "    def absorb(self, state, messages, exchange):\n        return state\n"
+    )
+    table = {"kind": "own_alone:Own"}
+    scenario = netkf.load(RING, {"horizon": 1.0, "filter": table, "network.activation.at": "nodes"})
+    run = netkf.simulate(scenario, engine="simpy")
+    page = netkf.page(run)
+    assert "--trust" in page.html
+    netkf.save(run, scenario, "RUN1")
+    with pytest.raises(netkf.ScenarioError, match=r"in Python: trust=True"):
+        netkf.page("RUN1")
+    assert netkf.page(netkf.open("RUN1", trust=True)).html == page.html
+    with pytest.raises(netkf.ScenarioError, match=r"in Python: trust=True"):
+        netkf.page(run, "RUN1")
+
+
 def test_a_notebook_shows_the_sentences_of_an_explanation():
     run = netkf.simulate(netkf.load(RING, {"horizon": 2.0}), engine="simpy")
     found = netkf.why(run, 1, 1.0)
