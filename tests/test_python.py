@@ -321,3 +321,26 @@ def test_numbers_too_large_are_one_line(ring):
     for words, call in calls.items():
         with pytest.raises(netkf.NetkfError, match=words):
             call()
+
+
+def test_what_is_no_scenario_is_answered_by_a_call_that_is_right(ring, tmp_path):
+    run = netkf.simulate(ring.replace({"horizon": 1.0}), engine="simpy")
+    calls = {
+        "netkf.simulate(netkf.load(path))": lambda: netkf.simulate("a.toml"),
+        "netkf.log_likelihood(netkf.load(path))": lambda: netkf.log_likelihood("a.toml"),
+        "netkf.fit_noise(netkf.load(path))": lambda: netkf.fit_noise("a.toml"),
+        "netkf.save(run, netkf.load(path), directory)": lambda: netkf.save(ring, run, tmp_path),
+        "netkf.theory.error_covariance(netkf.load(path), run)": lambda: theory.error_covariance(
+            run, ring
+        ),
+        "netkf.theory.covariance_bound(netkf.load(path), times)": lambda: theory.covariance_bound(
+            [1.0], ring
+        ),
+    }
+    for words, call in calls.items():
+        with pytest.raises(netkf.ScenarioError) as caught:
+            call()
+        assert str(caught.value).endswith(f"load it first: {words}")
+    netkf.save(run, run.scenario, tmp_path / "kept")
+    with pytest.raises(netkf.ScenarioError, match="directory: must be a new or empty directory"):
+        netkf.save(run, run.scenario, tmp_path / "kept")

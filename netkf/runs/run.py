@@ -125,14 +125,15 @@ def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
     Raises ScenarioError if the run belongs to another scenario or the directory is not empty, and
     WriteError.
     """
-    require_scenario(scenario, "save", ", directory")
+    require_scenario(scenario, "save", ", directory", "run, ")
     directory = as_path("directory", directory)
     known = files.require_run(run)
     # A run may have another seed than its scenario, which scenario.toml of a directory then has.
     if len({files.scenario_digest(one, seed=run.seed) for one in {known, scenario}}) > 1:
         rule = "must be a run of this scenario: their keys or files differ"
         raise ScenarioError("run", rule, run, "save it with run.scenario")
-    output = _create_output(scenario, directory, run.seed, run.replica, run.engine, tables=True)
+    known_by = run.seed, run.replica, run.engine
+    output = _create_output(scenario, directory, *known_by, tables=True, option="directory")
     for sink in output.sinks:
         sink.events(run.log)
         sink.exact_errors = run.exact_errors
@@ -205,10 +206,16 @@ class _Output:
 
 
 def _create_output(
-    scenario: Scenario, out: Path | None, seed: int, replica: int, engine: str, tables: bool
+    scenario: Scenario,
+    out: Path | None,
+    seed: int,
+    replica: int,
+    engine: str,
+    tables: bool,
+    option: str = "--out",
 ) -> _Output:
     files.check_sources(scenario)
-    directory = files.create_output_directory(out, scenario.name)
+    directory = files.create_output_directory(out, scenario.name, option)
     channel = scenario.network.channel
     is_recorded = isinstance(channel.loss, RecordedLoss) or isinstance(channel.delay, RecordedDelay)
     manifest = Manifest.of(scenario, directory, engine, seed=seed, replica=replica)

@@ -55,10 +55,12 @@ def _simpy_engine() -> Engine:
     return SimpyEngine()
 
 
-def require_scenario(value: object, function: str, rest: str = "") -> None:
-    """Raise ScenarioError unless ``value`` is a scenario; the remedy is a call of ``function``."""
+def require_scenario(value: object, function: str, rest: str = "", first: str = "") -> None:
+    """Raise ScenarioError unless ``value`` is a scenario; the remedy is a call of ``function``
+    with the arguments ``first`` before it and the ``rest`` after it.
+    """
     if not isinstance(value, Scenario):
-        remedy = f"load it first: netkf.{function}(netkf.load(path){rest})"
+        remedy = f"load it first: netkf.{function}({first}netkf.load(path){rest})"
         raise ScenarioError("", f"{function} takes a netkf.Scenario", value, remedy)
 
 

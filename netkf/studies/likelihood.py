@@ -343,12 +343,12 @@ def log_likelihood(scenario: Scenario, seed: int | None = None, replica: int = 0
     Raises ScenarioError for a model that is not linear, or that changes, for increments, and for
     readings whose noise rounding hides.
     """
+    require_scenario(scenario, "log_likelihood")
     model = _central_model(scenario, seed, replica)
     return model.value(np.ones(len(model.variances)))
 
 
 def _central_model(scenario: Scenario, seed: int | None, replica: int) -> CentralModel:
-    require_scenario(scenario, "the likelihood")
     seed = scenario.seed if seed is None else integer(low=0)("seed", seed)
     return CentralModel(scenario, seed, integer(low=0)("replica", replica))
 
@@ -364,6 +364,7 @@ def fit_noise(
     ``confidence`` is that of the interval of each variance. Raises ScenarioError, see
     ``log_likelihood``.
     """
+    require_scenario(scenario, "fit_noise")
     confidence = number(above=0.0, below=1.0)("confidence", confidence)
     model = _central_model(scenario, seed, replica)
     if not model.variances:

@@ -66,13 +66,15 @@ def scenario_of_estimates(scenario: Scenario) -> Scenario:
 def _check_first_argument(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
     """Return ``function`` with a check of its first argument, a Scenario, and of its flags."""
     signature = inspect.signature(function)
+    others = [key for key, one in signature.parameters.items() if one.default is one.empty][1:]
     flags = {key for key, entry in signature.parameters.items() if entry.annotation == "bool"}
 
     @wraps(function)
     def checked(scenario: Any, *args: Any, **kwargs: Any) -> Any:
         """Call the function with a scenario; raises ScenarioError for anything else."""
         if not isinstance(scenario, Scenario):
-            remedy = f"load it first: netkf.theory.{name}(netkf.load(path))"
+            call = ", ".join(["netkf.load(path)", *others])
+            remedy = f"load it first: netkf.theory.{name}({call})"
             raise ScenarioError("", f"theory.{name} takes a netkf.Scenario", scenario, remedy)
         if name not in OF_BLOCKS:
             scenario = scenario_of_estimates(scenario)
