@@ -43,6 +43,8 @@ from netkf.linalg.lanes import load, load_flags, select, spread, store
 
 NEGLIGIBLE = 1e-6
 """Standard deviation of a difference, relative to those of its terms, that counts as rounding."""
+UNSEEN = 1e-32
+"""Information about a component of the state, relative to the largest, that counts as 0."""
 CONVERGED = 1e-14
 """Relative change of covariances in a slot, of a few roundings, below which gains are constant."""
 
@@ -67,7 +69,7 @@ class PseudoStates(NamedTuple):
     """Matrices (n, n) of the pseudo-state ``G x``.
 
     G : information of all sensors together
-    inverse : its pseudo-inverse G^+
+    inverse : a pseudo-inverse G^+, that of least norm in units in which the diagonal of G is 1
     """
 
     G: FloatArray
@@ -76,10 +78,15 @@ class PseudoStates(NamedTuple):
 
 def pseudo_states(information: FloatArray) -> PseudoStates:
     """Return the matrices (n, n) of the pseudo-state ``G x``: G = ``information`` (n, n), that of
-    all sensors, and its pseudo-inverse.
+    all sensors, and a pseudo-inverse.
     """
     # Sensors may leave directions unobserved: G is singular then, and G^+ G projects on the others.
-    return PseudoStates(information, np.asarray(np.linalg.pinv(information, hermitian=True)))
+    # Which ones must not depend on the units of states; any generalised inverse serves.
+    sizes = np.diagonal(information)
+    units = np.sqrt(np.where(sizes > UNSEEN * sizes.max(), sizes, 1.0))
+    units = units[:, None] * units
+    inverse = np.linalg.pinv(information / units, hermitian=True) / units
+    return PseudoStates(information, np.asarray(inverse))
 
 
 class GainSequence:

@@ -28,9 +28,9 @@ MAX_PROJECTOR = 1e5
 each other, as the two of a constant velocity that rounding has moved apart, stay in one part.
 """
 ROUNDING = 1e-9
-"""Rates up to this (in slots; under clocks relative to the largest entry of A) count as 0."""
+"""Rates up to this (in slots; under clocks relative to ``flow_size``) count as 0."""
 SAME_RATE = 1e-6
-"""Rates that differ by less, relative to the largest entry of A, are one."""
+"""Rates that differ by less, relative to ``flow_size``, are one."""
 
 
 class ModeSplit(NamedTuple):
@@ -56,6 +56,11 @@ def slot_rates(F: FloatArray) -> FloatArray:
 def flow_rates(A: FloatArray) -> FloatArray:
     """Return the growth rates (n,) of the modes of A (n, n), in 1/s."""
     return np.asarray(np.linalg.eigvals(A).real)
+
+
+def flow_size(A: FloatArray) -> float:
+    """Return the largest entry of A (n, n) in units of states in which it is balanced, in 1/s."""
+    return float(np.abs(balance(A)[0]).max(initial=0.0))
 
 
 def split_modes(A: FloatArray, level: float, slotted: bool) -> ModeSplit | None:
@@ -118,7 +123,7 @@ def _shared_frame(entries: bytes, n: int, slotted: bool) -> ModeFrame:
     """Return the frame of a plant whose F (``slotted``) or A (n, n) has these ``entries``."""
     A = np.frombuffer(entries).reshape(n, n)
     rates = slot_rates(A) if slotted else flow_rates(A)
-    tolerance = ROUNDING * (1.0 if slotted else np.abs(A).max(initial=0.0))
+    tolerance = ROUNDING * (1.0 if slotted else flow_size(A))
     # Modes on the wrong side lose digits as fast as their rates: no such mode is best. All modes on
     # one side need no other coordinates, and are tried first among equals.
     levels = [np.inf, -np.inf, *_levels(rates)]
@@ -179,7 +184,7 @@ class RateGroups(NamedTuple):
 def _shared_groups(entries: bytes, n: int) -> RateGroups:
     """Return the groups of rates of a plant whose A (n, n) has these ``entries``."""
     A = np.frombuffer(entries).reshape(n, n)
-    rates, size = flow_rates(A), np.abs(A).max(initial=0.0)
+    rates, size = flow_rates(A), flow_size(A)
     ordered = np.sort(rates)[::-1]
     # A group's rate is that of its fastest mode, which must not grow; all that do not decay, or not
     # by more than rounding, are one group.

@@ -75,7 +75,7 @@ node fail in one step, and then freezes a wrong one.
 NEVER_STOPPED = np.iinfo(np.int64).max
 """A slot that no run reaches, for a node that never stops."""
 ROUNDING = 2.0**-52
-"""Spacing of floating-point numbers at 1: relative size of pivots that are 0."""
+"""Spacing of floating-point numbers at 1: share of a diagonal entry that counts as 0."""
 MAX_STEPS = 100_000
 """The largest ``gamma``: a larger one is a mistake."""
 MAX_DOUBLINGS = 60
@@ -336,21 +336,17 @@ def correct_root(
     """Replace ``root[h]`` by the root of ``(P^-1 + G)^-1 = P (I + G P)^-1``, P (7), with the
     information G = ``information[h]`` (n, n, L); ``scratch`` are (n, n, L) and three (n, L).
     """
-    # G = sum v v' by Cholesky with the largest pivot first. Each v' is used as an observation with
-    # noise of variance 1: nothing is inverted, and P may be singular.
+    # G = sum v v' by Cholesky, first the row of which most is left. Each v' is used as an
+    # observation with noise of variance 1: nothing is inverted, and P may be singular.
     remainder, v, row, gains = scratch
     n = len(size)
-    largest = spread(lanes, 0.0)
-    # The largest diagonal entry is the scale of G: pivots far below it are rounding.
     for i in range(n):
-        diagonal = load(lanes, information, h, i, i)
-        largest = select(diagonal > largest, diagonal, largest)
         for j in range(n):
             store(lanes, remainder, i, j, load(lanes, information, h, i, j))
     for _ in range(n):
-        pivot = largest_row(lanes, remainder, v)
+        pivot, share = fullest_row(lanes, remainder, information, h, v)
         # The remainder is rounding of G: G has no further rank to use. ``>`` also ends on nan.
-        useful = pivot > ROUNDING * n * largest
+        useful = share > ROUNDING * n
         if not any_lane(useful):
             return
         # v' = remainder[largest] / sqrt(pivot), the next row of the Cholesky factor; zeros, which
@@ -373,21 +369,23 @@ def correct_root(
 
 
 @kernel(inlined=True)
-def largest_row(lanes: Lanes, remainder: FloatArray, v: FloatArray) -> Any:
-    """Write the row of ``remainder`` (n, n, L) with the largest diagonal entry into ``v`` (n, L),
-    lane by lane; return that entry (L,).
+def fullest_row(
+    lanes: Lanes, remainder: FloatArray, information: FloatArray, h: int, v: FloatArray
+) -> tuple[Any, Any]:
+    """Write the row of ``remainder`` (n, n, L) whose diagonal entry is the largest share of that of
+    ``information[h]`` into ``v`` (n, L), lane by lane; return that entry and the share (L,).
     """
-    # For correct_root: pivoting by the diagonal reveals the rank of G.
-    n, pivot = len(remainder), load(lanes, remainder, 0, 0)
-    for j in range(n):
-        store(lanes, v, j, load(lanes, remainder, 0, j))
-    for i in range(1, n):
-        diagonal = load(lanes, remainder, i, i)
-        larger = diagonal > pivot
-        pivot = select(larger, diagonal, pivot)
-        for j in range(n):
-            store(lanes, v, j, select(larger, load(lanes, remainder, i, j), load(lanes, v, j)))
-    return pivot
+    # Shares, unlike the entries themselves, do not depend on the units of the states.
+    nothing = spread(lanes, 0.0)
+    pivot = share = nothing
+    for i in range(len(remainder)):
+        left, whole = load(lanes, remainder, i, i), load(lanes, information, h, i, i)
+        own = select(whole > 0.0, left / whole, nothing)
+        more = own > share
+        pivot, share = select(more, left, pivot), select(more, own, share)
+        for j in range(len(remainder)):
+            store(lanes, v, j, select(more, load(lanes, remainder, i, j), load(lanes, v, j)))
+    return pivot, share
 
 
 @kernel

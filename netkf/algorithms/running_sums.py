@@ -52,6 +52,7 @@ from netkf.linalg.jacobi import diagonalise
 from netkf.linalg.lanes import ONE
 from netkf.linalg.local import local_matrix, local_vector
 from netkf.linalg.series import ORDER_9, horner
+from netkf.linalg.spectra import balance
 from netkf.linalg.structs import Size
 
 MIN_ACCURACY = 1e-4
@@ -106,7 +107,7 @@ def _tables_of(n: int, A: bytes) -> tuple[RateGroups, float, FloatArray]:
 def _table_of(groups: RateGroups) -> tuple[float, FloatArray]:
     """Return the length of a cell (s), and Taylor coefficients (CELLS, terms, n n + G)."""
     kept, rates, terms = groups.kept, groups.rates, len(ORDER_9) + 1
-    norm = max(np.abs(kept).sum(axis=1).max(), rates.max(initial=0.0), 1e-12)
+    norm = max(np.abs(balance(kept)[0]).sum(axis=1).max(), rates.max(initial=0.0), 1e-12)
     unit, n = 2.0 ** np.floor(np.log2(REACH / norm)), len(kept)
     middles = unit * (np.arange(CELLS) + 0.5)
     middles[0] = 0.0

@@ -71,12 +71,16 @@ def symmetric(matrices: FloatArray) -> FloatArray:
 
 
 def is_semidefinite(matrix: FloatArray, tolerance: float = 1e-10) -> bool:
-    """Return True if no eigenvalue of a symmetric ``matrix`` (n, n) is below -tolerance times its
-    largest.
+    """Return True if no eigenvalue of a symmetric ``matrix`` (n, n), whose rows have their own
+    units, is below -tolerance, where the diagonal is at most 1.
     """
-    values = np.linalg.eigvalsh(matrix)
-    # Relative to the largest eigenvalue; the smallest normal number admits the zero matrix.
-    return bool(values[0] >= -tolerance * max(abs(values[-1]), np.finfo(float).tiny))
+    sizes = np.diagonal(matrix)
+    largest = np.abs(matrix).max(initial=0.0)
+    # Rows that are rounding of zero beside the largest have no units.
+    rounding = 1e-13 * largest
+    units = np.sqrt(np.where(sizes > rounding, sizes, largest or 1.0))
+    values = np.linalg.eigvalsh(matrix / units[:, None] / units)
+    return bool((sizes >= -rounding).all() and values[0] >= -tolerance)
 
 
 def is_definite(matrices: FloatArray) -> NDArray[np.bool_]:

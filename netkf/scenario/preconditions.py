@@ -19,7 +19,7 @@ from netkf.algorithms.translation import read_vector
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import walk
 from netkf.linalg.arrays import FloatArray, is_definite
-from netkf.linalg.spectra import hidden_mode, outputs_of
+from netkf.linalg.spectra import balance, hidden_mode, outputs_of
 from netkf.network.clocks import LinkClock
 from netkf.network.contacts import Contacts
 from netkf.network.matchings import SlotActivation
@@ -251,7 +251,7 @@ def _check_invertible(scenario: DerivedScenario) -> None:
     if scenario.slotted:
         nonsingular = all(
             bool(is_definite(Q))
-            or (singular is None and (not linear or np.linalg.matrix_rank(F) == len(F)))
+            or (singular is None and (not linear or np.linalg.matrix_rank(balance(F)[0]) == len(F)))
             for pieces in of_nodes
             for F, Q in pieces
         )
