@@ -19,11 +19,15 @@ from netkf.logs.outcomes import (
     Group,
     LogOutcomes,
     binomial_interval,
+    choose_windows,
+    correlation_time,
     counts_in,
     fit_chain,
     fit_distance,
+    long_run_sum,
     make_outcomes,
     shared_fate,
+    shared_law,
 )
 from netkf.logs.outcomes import test_time as time_test
 from netkf.scenario.writing import as_table
@@ -121,6 +125,37 @@ def test_the_share_of_one_fate_from_none_to_all(share):
     assert abs(errors.mean()) < 4.0 * max(errors.std(), 1e-12) / 10.0 + 0.005
     covered = [abs(e) <= 1.96 * f.error + 1e-9 for e, f in zip(errors, found, strict=True)]
     assert rate(covered) > binomial_range(100, 0.95)[0]
+    stated = np.mean([f.error for f in found])
+    assert stated == pytest.approx(errors.std(), rel=0.3, abs=0.005)  # nor is it too large
+
+
+def test_statistics_are_what_plain_sums_say():
+    random = np.random.default_rng(1)
+    units = random.normal(size=40)
+    apart = np.abs(np.subtract.outer(np.arange(40), np.arange(40)))
+    by_hand = units @ np.maximum(1.0 - apart / 6.0, 0.0) @ units
+    assert long_run_sum(units, 5) == pytest.approx(by_hand)
+    heard = np.array([0.0, 3.0, 9.0])
+    exact = [scipy.stats.binomtest(int(k), 9).proportion_ci(0.95) for k in heard]
+    np.testing.assert_allclose(
+        np.transpose(binomial_interval(heard, 9.0 + 0.0 * heard, LEVEL)), exact
+    )
+    outcomes, p, share = drawn(random, T=40, share=0.4, senders=1), 0.7, 0.3
+    x = outcomes.groups[0].x
+    one = np.where(x.all(axis=1), p, np.where(x.any(axis=1), 0.0, 1.0 - p))
+    rows = (1.0 - share) * np.where(x == 1.0, p, 1.0 - p).prod(axis=1) + share * one
+    likelihood, variance = shared_law(outcomes, p, share)
+    assert likelihood == pytest.approx(np.log(rows).sum())
+    assert variance == pytest.approx(((x.sum(axis=1) - 3.0 * p) ** 2).sum() / 120.0**2)
+
+
+def test_the_time_of_a_chain_and_no_windows_without_a_change():
+    """Correlations of .6 ** lag add up to (1 + .6) / (1 - .6); noise has no edges."""
+    chain = (0.1, 0.3, 1.0, 0.0)
+    found = [correlation_time(drawn(random, chain=chain)) for random in seeds(40, 10)]
+    assert np.mean(found) == pytest.approx(4.0, rel=0.1)
+    edges = [choose_windows(drawn(random)) for random in seeds(60, 11)]
+    assert rate(map(len, edges)) < 0.1
 
 
 @pytest.mark.slow
@@ -211,13 +246,15 @@ def test_the_chain_of_two_states():
 
 
 def test_the_logistic_function_of_the_distance():
-    inside = []
+    inside, off = [], []
     for random in seeds(200, 7):
         d, n = random.uniform(5.0, 50.0, 30), np.full(30, 40.0)
         heard = random.binomial(40, 1.0 / (1.0 + np.exp((d - 25.0) / 6.0))).astype(float)
         values, cov = fit_distance(d, n, heard, 1.0)
-        inside.append(np.abs(values - [25.0, 6.0]) < 1.96 * np.sqrt(np.diag(cov)))
+        off.append((values - [25.0, 6.0]) / np.sqrt(np.diag(cov)))
+        inside.append(np.abs(off[-1]) < 1.96)
     assert (np.mean(inside, axis=0) > binomial_range(200, 0.95)[0]).all()
+    np.testing.assert_allclose(np.std(off, axis=0), 1.0, atol=0.2)
 
 
 def test_the_distance_when_nodes_move(tmp_path):
@@ -459,6 +496,7 @@ def test_channels_and_stretches_are_kept_apart():
     ]
     assert np.isnan(outcomes.groups[1].x[1]).tolist() == [True, False]
     assert outcomes.counts.tolist() == [[8, 8], [9, 9]]
+    assert outcomes.transitions.tolist() == [[4, 0, 0, 0], [6, 0, 0, 0]]
 
 
 def test_only_a_record_can_be_fitted(tmp_path):
