@@ -152,7 +152,7 @@ def test_statistics_are_what_plain_sums_say():
 def test_the_time_of_a_chain_and_no_windows_without_a_change():
     """Correlations of .6 ** lag add up to (1 + .6) / (1 - .6); noise has no edges."""
     chain = (0.1, 0.3, 1.0, 0.0)
-    found = [correlation_time(drawn(random, chain=chain)) for random in seeds(40, 10)]
+    found = [correlation_time(drawn(random, T=60, chain=chain)) for random in seeds(100, 10)]
     assert np.mean(found) == pytest.approx(4.0, rel=0.1)
     edges = [choose_windows(drawn(random)) for random in seeds(60, 11)]
     assert rate(map(len, edges)) < 0.1
@@ -287,6 +287,7 @@ def test_the_distance_when_nodes_move(tmp_path):
     assert row["log_likelihood"] == pytest.approx(-best.fun, rel=1e-6)
     assert row["rejected_by"] == ""
     assert row["bic"] == fit.laws["bic"].min()
+    assert row["bic"] == pytest.approx(2.0 * math.log(len(d)) - 2.0 * row["log_likelihood"])
 
 
 def test_runs_draw_parameters_from_their_posterior():
