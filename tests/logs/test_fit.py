@@ -428,6 +428,10 @@ def test_channels_that_are_alike_stay_so_where_nobody_hears_many_packets(tmp_pat
     netkf.import_log(tmp_path / "log.csv", "csv", tmp_path / "out")
     tests = netkf.fit_log(tmp_path / "out", runs=0).tests.set_index("key")
     assert tests.loc["channel", "verdict"] == "not rejected"
+    # All tests hold together.
+    confidence = 1.0 - 1.5 * tests["p"].min()
+    again = netkf.fit_log(tmp_path / "out", runs=0, confidence=confidence).tests
+    assert "rejected" not in set(again["verdict"])
 
 
 @pytest.mark.parametrize("symmetric", ["false", "true"])
@@ -461,6 +465,16 @@ def test_links_with_bursts_of_their_own(tmp_path, symmetric):
     assert (own["p"] > 0.005).all()
     loss = netkf.load(fit.scenarios["per-link-bursts"]).network.channel.loss
     assert loss.of((0, 1)).to_bad == table["to_bad"][0]
+    # Intervals of all links together, of to_bad and to_good too; bursts widen those of deliveries.
+    log = pd.read_csv(tmp_path / "log.csv").query("src == 0 and dst == 1")["heard"].to_numpy()
+    row, level = fit.links.iloc[0], 0.05 / len(fit.links)
+    next_ones = log[1:][log[:-1] == 1]
+    exact = scipy.stats.binomtest(int((next_ones == 0).sum()), len(next_ones))
+    assert (row["to_bad_low"], row["to_bad_high"]) == pytest.approx(
+        tuple(exact.proportion_ci(1.0 - level / 2.0))
+    )
+    exact = scipy.stats.binomtest(int(log.sum()), len(log)).proportion_ci(1.0 - level)
+    assert row["high"] - row["low"] > 1.3 * (exact.high - exact.low)
 
 
 def test_directions_without_a_packet_have_the_law_of_the_others(tmp_path):
