@@ -132,11 +132,10 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_collection_finish():
-    """Modules and tests stay: as old objects the garbage collector looks at them seldom, and not at
+    """Modules and tests stay: the garbage collector need not look at them again and again, nor at
     what a test makes every 700 objects.
     """
     gc.freeze()
-    gc.unfreeze()
     gc.set_threshold(20_000, 20, 20)
 
 

@@ -156,9 +156,8 @@ def collect_garbage_later() -> None:
 
     def collect() -> None:
         time.sleep(KEEPING_SECONDS)
-        # What was imported until now stays: as old objects it is looked through seldom.
+        # What was imported until now stays: it need not be looked through again and again.
         gc.freeze()
-        gc.unfreeze()
         gc.enable()
 
     gc.disable()

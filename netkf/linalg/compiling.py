@@ -320,9 +320,10 @@ def _compile_well(function: Any, method: str, loops: Callable[..., Any]) -> None
 
 def _count_as_old() -> None:
     """Leave all objects to the next full collection: visiting the new ones now takes as long."""
-    # What others have frozen stays frozen.
-    if gc.get_freeze_count() == 0:
-        gc.freeze()
+    has_frozen = gc.get_freeze_count() > 0
+    gc.freeze()
+    # Who has frozen objects wants them to stay so, and these with them.
+    if not has_frozen:
         gc.unfreeze()
 
 
