@@ -58,6 +58,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 # Kernels are not called from C: the wrapper would be a seventh of the compiled code.
 PRIVATE_OPTIONS = ("no_cfunc_wrapper", "_nrt")
 _OPTIONS: Any = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+_has_frozen = [False]
 _announcing = [False]
 """Whether the next kernel that is compiled is announced."""
 _compile_times: list[float] = []
@@ -320,10 +321,10 @@ def _compile_well(function: Any, method: str, loops: Callable[..., Any]) -> None
 
 def _count_as_old() -> None:
     """Leave all objects to the next full collection: visiting the new ones now takes as long."""
-    has_frozen = gc.get_freeze_count() > 0
+    # Who has frozen objects wants them to stay so, and these with them. Counting takes long.
+    _has_frozen[0] = _has_frozen[0] or gc.get_freeze_count() > 0
     gc.freeze()
-    # Who has frozen objects wants them to stay so, and these with them.
-    if not has_frozen:
+    if not _has_frozen[0]:
         gc.unfreeze()
 
 
