@@ -38,10 +38,21 @@ MAX_MEMORY = 2**25
 """Numbers that all nodes may keep in a run, of which several may be side by side."""
 
 
+LATE_NOTE = (
+    "of a message that took time it uses readings of instants at which the receiver has read "
+    "something too, and no others: the window has no states of other instants"
+)
+
+
 def note_loops(scenario: Any) -> tuple[str, ...]:
-    """Return a note for the user where the graph of a ``netkf.Scenario`` has loops."""
+    """Return notes for the user where the graph of a ``netkf.Scenario`` has loops, and where
+    messages take time.
+    """
     rule = "the graph has loops, on which evidence returns and counts again; P is too small"
-    return () if is_forest(scenario) else (f"block-belief-propagation: {rule}",)
+    notes = [] if is_forest(scenario) else [rule]
+    if not scenario.slotted and scenario.network.channel.delay.fixed != 0.0:
+        notes.append(LATE_NOTE)
+    return tuple(f"block-belief-propagation: {note}" for note in notes)
 
 
 def path_record(
@@ -99,7 +110,8 @@ class BlockBeliefPropagation(Filter):
 
     On a tree P is the covariance of the error, whatever is lost, late or out of order, also with
     noise of the plant: lost messages keep the last one heard. With a window as long as the run it
-    is that of the Kalman filter with all readings that have reached the node; if nothing is lost
+    is that of the Kalman filter with all readings that have reached the node, where nodes read at
+    the same instants: a reading of another instant counts if it comes at once. If nothing is lost
     and ``steps`` is the diameter of the tree, that of all blocks. A shorter window makes P larger.
     Where links form loops P is too small. What is not linear is linearised at beliefs.
     """

@@ -47,7 +47,7 @@ NAIVE_NOTE = (
 )
 LATE_NOTE = (
     "block-intersection uses no reading of the receiver in a message that took time: P may grow; "
-    "block-belief-propagation uses late ones too"
+    "block-belief-propagation uses those of instants at which the receiver has read something too"
 )
 RULES = {"naive": NAIVE, "ci": CI, "split": SPLIT}
 

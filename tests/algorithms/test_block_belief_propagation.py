@@ -210,6 +210,35 @@ def test_loops_are_noted(tmp_path: Path) -> None:
     assert not any("loops" in note for note in load(ROBOTS, tmp_path, **belief).notes)
 
 
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_late_readings_count_at_instants_of_the_receiver_and_a_note_says_so(
+    tmp_path: Path, engine: str
+) -> None:
+    place = {"of": "pose", "nodes": [1], "H": [[1.0]], "R": [[0.1]]}
+    place["sampling"] = {"kind": "periodic", "period": 1.0}
+    delay = {"delay": {"kind": "constant", "seconds": 0.05}}
+    lost = {"loss": {"kind": "bernoulli", "delivery": 0.0}}
+
+    def last_P(phases: tuple[float, float], channel: dict[str, object]) -> float:
+        sees = [
+            {
+                **{"kind": "relative", "of": "pose", "nodes": [i], "to": [[i, j]], "R": [[0.3]]},
+                "sampling": {"kind": "periodic", "period": 0.5, "phase": phase},
+            }
+            for i, j, phase in zip((1, 2), (2, 1), phases, strict=True)
+        ]
+        keys: dict[str, object] = {"sensors": [place, *sees], "network__channel": channel}
+        belief = {"filter": BELIEF | {"estimates": "own"}}
+        scenario = load(CLOCKED, tmp_path, **keys, **belief)
+        noted = any("that took time it uses readings of instants" in n for n in scenario.notes)
+        assert noted == (channel is delay)
+        return float(netkf.simulate(scenario, engine=engine).P[-1, 1, 0, 0])
+
+    assert last_P((0.0, 0.0), delay) < 0.6 * last_P((0.0, 0.0), lost)
+    assert last_P((0.1, 0.3), delay) == pytest.approx(last_P((0.1, 0.3), lost), rel=1e-9)
+    assert last_P((0.1, 0.3), {}) < 0.6 * last_P((0.1, 0.3), lost)
+
+
 def test_bearings_of_nodes_that_are_nearly_at_one_place(tmp_path: Path) -> None:
     """Their derivatives are so large that squares of them leave nothing of R."""
     table = {
