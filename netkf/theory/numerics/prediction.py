@@ -13,6 +13,8 @@ digits. An error is a linear form of independent standard normal inputs, its coe
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from netkf.algorithms.kernels.riccati import exponential_series, hamiltonian
@@ -67,6 +69,21 @@ class ErrorFlow:
         M, self._scale = hamiltonian(A, B @ B.T, self._H.T @ self._H)
         self._exponential = ShortExponential(M)
         self.unit = self._exponential.unit
+        # A long gap is many equal steps.
+        self._over = lru_cache(maxsize=1)(self._matrices_over)
+
+    def _matrices_over(self, gap: float) -> tuple[FloatArray, ...]:
+        """Return what depends on the ``gap`` (s) alone: at the nodes [X', Y'] = upper + P lower;
+        from P = 0 F = X(gap)^-T, the information Gamma' Gamma of readings, and a root of P(gap).
+        """
+        n, weights = len(self._H.T), np.sqrt(WEIGHTS * gap)[:, None, None]
+        E = self._exponential(np.append(NODES, 1.0) * gap).swapaxes(1, 2).copy()
+        E[:, :n, n:] *= self._scale
+        E[:, n:, :n] /= self._scale
+        upper, lower, inverse = E[:-1, :n], E[:-1, n:], np.linalg.inv(E[:, :n, :n])
+        F, Gamma = inverse[-1], (weights * (self._H @ inverse[:-1])).reshape(-1, n)
+        start = _narrowed(_side_by_side(weights * (F @ upper @ self._assumed)))
+        return upper, lower, F, Gamma, start
 
     def move(
         self, errors: FloatArray, roots: FloatArray, gap: float, columns: tuple[int, int]
@@ -76,14 +93,7 @@ class ErrorFlow:
         of the plant's 8 m inputs, and the first of n inputs of each error.
         """
         n, weights = errors.shape[1], np.sqrt(WEIGHTS * gap)[:, None, None]
-        # At the nodes [X', Y'] = upper + P lower, and at the end of the gap.
-        E = self._exponential(np.append(NODES, 1.0) * gap).swapaxes(1, 2).copy()
-        E[:, :n, n:] *= self._scale
-        E[:, n:, :n] /= self._scale
-        upper, lower, inverse = E[:-1, :n], E[:-1, n:], np.linalg.inv(E[:, :n, :n])
-        # From P = 0: F = X(g)^-T, the information Gamma' Gamma of readings, and a root of P(g).
-        F, Gamma = inverse[-1], (weights * (self._H @ inverse[:-1])).reshape(-1, n)
-        start = _narrowed(_side_by_side(weights * (F @ upper @ self._assumed)))
+        upper, lower, F, Gamma, start = self._over(gap)
         # L L' = I + S' G S, so that J = (I + P G)^-1 = I - S (L L')^-1 S' G and S L^-T is a root of
         # J P.
         SG = np.swapaxes(Gamma @ roots, 1, 2)
@@ -125,9 +135,13 @@ class StateFlow:
         self._exp, self._B = ShortExponential(A), B
         self.unit = self._exp.unit
         self.inputs = len(NODES) * B.shape[1]
+        self._over = lru_cache(maxsize=1)(self._matrices_over)
 
     def __call__(self, gap: float) -> tuple[FloatArray, FloatArray]:
         """Return transition (n, n) and response (n, 8 m) to inputs over a short ``gap`` (s)."""
+        return self._over(gap)
+
+    def _matrices_over(self, gap: float) -> tuple[FloatArray, FloatArray]:
         E = self._exp(np.append((1.0 - NODES) * gap, gap))
         root_weights = np.sqrt(WEIGHTS * gap)[:, None, None]
         return E[-1], _side_by_side(root_weights * (E[:-1] @ self._B))
