@@ -205,7 +205,8 @@ def compare_with_laws(
             # A quantity of few values, such as a share of time that is nearly 1, is not normal.
             is_normal = spread > 0.0 and len(np.unique(drawn)) > runs // 2
             if 2.0 / (runs + 1) > level and is_normal:
-                off = (value - drawn.mean()) / (spread * math.sqrt(1.0 + 1.0 / runs))
+                spread *= math.sqrt(1.0 + 1.0 / runs)  # of a new value about the mean of these
+                off = (value - drawn.mean()) / spread
                 p = 2.0 * float(student_t.sf(abs(off), runs - 1))
                 half = spread * float(student_t.isf(level / 2, runs - 1))
                 low, high = drawn.mean() - half, drawn.mean() + half

@@ -463,6 +463,12 @@ def test_links_with_bursts_of_their_own(tmp_path, symmetric):
     np.testing.assert_allclose(table["to_bad"], 0.02 + 0.03 * table["sender"], atol=0.04)
     own = fit.envelope[fit.envelope["law"] == "per-link-bursts"]
     assert (own["p"] > 0.005).all()
+    # Of six runs Student's t, of both sides.
+    row = own.set_index("quantity").loc["messages heard"]
+    middle, half = 0.5 * (row["low"] + row["high"]), 0.5 * (row["high"] - row["low"])
+    reach = scipy.stats.t.isf(0.5 * 0.05 / len(own), 5)
+    off = abs(row["replay"] - middle) / half * reach
+    assert row["p"] == pytest.approx(2.0 * scipy.stats.t.sf(off, 5))
     loss = netkf.load(fit.scenarios["per-link-bursts"]).network.channel.loss
     assert loss.of((0, 1)).to_bad == table["to_bad"][0]
     # Intervals of all links together, of to_bad and to_good too; bursts widen those of deliveries.

@@ -364,6 +364,19 @@ def test_a_clock_that_begins_again_is_told(tmp_path):
     assert "merged: 1 row of an outcome told before, up to 0.1 s apart" in notes
 
 
+def test_one_of_before_the_wrap_may_come_late():
+    counters, wraps, *_ = unwrap(np.array([253, 255, 0, 254, 1, 2]), np.arange(6.0))
+    assert (counters.tolist(), wraps) == ([253, 255, 256, 254, 257, 258], 1)
+
+
+def test_the_stamp_of_the_sender_counts(tmp_path):
+    rows = ["t,sender,receiver,number,event"]
+    rows += [f"{k + 0.05 * (-1) ** k:.2f},0,1,{k},rx" for k in range(1, 20)]
+    rows += [f"{k},0,,{k},tx" for k in range(1, 20)]
+    netkf.import_log(write(tmp_path / "log.csv", rows), "csv", tmp_path / "out")
+    assert table(tmp_path / "out", "outcomes.csv")["t"].tolist() == list(range(1, 20))
+
+
 def test_counters_begin_again():
     numbers = np.array([*range(40, 70), *range(30), *range(5)])
     counters, wraps, _, restarts = unwrap(numbers, np.arange(len(numbers), dtype=float))
