@@ -17,6 +17,7 @@ from netkf.cli.main import main
 from netkf.scenario.reading import from_table
 from netkf.studies.innovation_tests import (
     Stretch,
+    _bias,
     _ends_of,
     find_stretch,
     format_innovations,
@@ -68,6 +69,20 @@ def drawn(random, readings=120, nodes=4, rows=1, change=None):
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory):
     return from_table(WALK, tmp_path_factory.mktemp("walk"))
+
+
+def test_a_bias_is_that_of_weighted_least_squares(walk):
+    """Of values v with deviations d; correlated ones count for less, by Student's quantile."""
+    recorded = drawn(np.random.default_rng(8), nodes=1)
+    d = np.geomspace(0.2, 5.0, 120)
+    v = np.concatenate(recorded.whitened) * d + 0.4
+    recorded = recorded._replace(values=list(v[:, None]), deviations=list(d[:, None]))
+    row = judge_innovations(walk, recorded, 0.96).rows[0]
+    assert row.bias == pytest.approx(np.average(v, weights=d**-2.0))
+    error = (d**-2.0).sum() ** -0.5
+    assert row.bias_reach == pytest.approx(scipy.stats.norm.isf(0.01 / 2.0) * error)
+    *_, reach, _, _ = _bias(recorded, np.arange(120), np.zeros(120, dtype=int), 4.0, 0.01)
+    assert reach == pytest.approx(scipy.stats.t.isf(0.01 / 2.0, 120 / 4.0 - 1.0) * 2.0 * error)
 
 
 def broken(tests):

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
+import scipy.stats
 
 import netkf
 from netkf.checks.innovations import compute_innovations
@@ -88,8 +89,27 @@ def test_likelihood_and_its_maximum_are_those_of_statsmodels(name, request):
     assert found.log_likelihood == pytest.approx(right["maximum"], abs=1e-8)
     np.testing.assert_allclose(found.table["value"], right["values"], rtol=1e-6)
     np.testing.assert_allclose(found.table["se"], right["se"], rtol=1e-4)
+    # At 95 %, of logarithms.
+    reach = 1.959964 * found.table["se"] / found.table["value"]
+    np.testing.assert_allclose(found.table["high"], found.table["value"] * np.exp(reach), rtol=1e-5)
+    np.testing.assert_allclose(found.table["low"], found.table["value"] * np.exp(-reach), rtol=1e-5)
     # The scenario it returns has the matrices that it says.
     assert log_likelihood(found.scenario) == pytest.approx(found.log_likelihood, abs=1e-8)
+
+
+def test_slots_without_readings_are_predictions(tmp_path):
+    """The density of all readings together, two of one instant among them, by their covariance."""
+    k, y = np.array([1, 2, 2, 5, 9]), np.array([0.3, -1.0, 0.4, 2.0, 0.7])
+    pd.DataFrame({"t": k, "node": 0, "y0": y}).to_csv(tmp_path / "y.csv", index=False)
+    plant = {"kind": "unknown", "F": [[0.8]], "Q": [[0.3]], "period": 1.0, "cov": [[2.0]]}
+    sensor = {"kind": "recorded", "path": "y.csv", "H": [[1.5]], "R": [[0.4]]}
+    steady = 0.3 / (1.0 - 0.8**2)
+    variance = steady + 0.64**k * (2.0 - steady)
+    first = np.minimum.outer(np.arange(5), np.arange(5))
+    x = 0.8 ** np.abs(np.subtract.outer(k, k)) * variance[first]
+    law = scipy.stats.multivariate_normal(np.zeros(5), 1.5**2 * x + 0.4 * np.eye(5))
+    given = scenario(tmp_path, plant, sensor, 10.0)
+    assert log_likelihood(given) == pytest.approx(law.logpdf(y), abs=1e-9)
 
 
 def test_statsmodels_still_says_so():
