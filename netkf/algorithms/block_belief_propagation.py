@@ -105,8 +105,9 @@ class BlockBeliefPropagation(Filter):
     have read of each other.
 
     steps   messages on each directed link in a slot
-    window  instants that nodes remember. A message replaces that which was heard before, of which
-            only what it says of the window is kept, unless that makes P smaller than the new one
+    window  instants that nodes remember: of readings, and in slots of sending. A message replaces
+            that which was heard before, of which only what it says of the window is kept, unless
+            that makes P smaller than the new one
 
     On a tree P is the covariance of the error, whatever is lost, late or out of order, also with
     noise of the plant: lost messages keep the last one heard. With a window as long as the run it
