@@ -196,9 +196,10 @@ class Kernel:
     def compile_entry(self, arguments: tuple[Any, ...], returns_number: bool) -> int:
         """Return the address of a C function for ``arguments`` of these types, which returns a
         float or nothing (``addresses``); compile it, or load it from disk. Raises TypeError for a
-        user's function that raises: C has no exceptions, and a run would go on with what is there.
+        user's function that raises: C has no exceptions, and a run would go on with what is there;
+        and for one that prints, which needs the interpreter's lock: a run may wait for it forever.
         """
-        _require_no_raise(self._loops, set())
+        require_quiet(self._loops, set())
         numba = require_numba()
         returned = numba.types.float64 if returns_number else numba.types.void
         kinds = tuple(map(numba.typeof, arguments))
@@ -223,20 +224,25 @@ class Kernel:
         return {name: self._options[name] for name in self._options.keys() - _unknown_options()}
 
 
-def _require_no_raise(loops: Callable[..., Any], seen: set[Any]) -> None:
-    """Raise TypeError if a user's function, or a kernel that it calls, raises an exception."""
+def require_quiet(loops: Callable[..., Any], seen: set[Any]) -> None:
+    """Raise TypeError if a user's function, or a kernel that it calls, raises or prints."""
     code, names = loops.__code__, loops.__globals__
     if loops in seen or str(names.get("__name__")).partition(".")[0] == "netkf":
         return
     seen.add(loops)
     for step in dis.get_instructions(code):
-        if step.opname == "RAISE_VARARGS":
+        raises = step.opname == "RAISE_VARARGS"
+        if raises or (step.opname == "LOAD_GLOBAL" and step.argval == "print"):
             lines = (line for begin, end, line in code.co_lines() if begin <= step.offset < end)
             where = f"{code.co_filename}, line {next(lines, code.co_firstlineno)}"
-            raise TypeError(f"a kernel must not raise ({where}): write nan, which ends the run")
+            what = "raise" if raises else "print"
+            remedy = (
+                "write nan, which ends the run" if raises else "set NUMBA_DISABLE_JIT=1 for that"
+            )
+            raise TypeError(f"a kernel must not {what} ({where}): {remedy}")
     for callee in map(names.get, code.co_names):
         if isinstance(callee, Kernel):
-            _require_no_raise(callee.loops, seen)
+            require_quiet(callee.loops, seen)
 
 
 def _make_kernel(

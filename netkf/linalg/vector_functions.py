@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray, real_numbers
-from netkf.linalg.compiling import require_numba
+from netkf.linalg.compiling import require_numba, require_quiet
 from netkf.linalg.functions import plain_address
 from netkf.linalg.plain import is_plain
 
@@ -52,6 +52,8 @@ class VectorFunction:
             return int(ctypes.cast(self._code, ctypes.c_void_p).value or 0)
         require_numba()
         from netkf.linalg.function_types import compile_function
+
+        require_quiet(getattr(self._function, "loops", self._function), set())
 
         self._code = compile_function(self._function, self._shapes, self._takes_period)
         return int(self._code.address)

@@ -489,6 +489,36 @@ def test_what_cannot_be_compiled_is_told_in_one_line_with_its_place(verb, engine
             check_filter(Uncompiled(verb))
 
 
+@kernel
+def printing(record, h, run):
+    print("here")
+
+
+@pytest.mark.skipif(is_plain(), reason="nothing is compiled")
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_a_kernel_that_prints_is_refused(engine, ring):
+    """It takes the lock that the run has given away, and some runs waited for it forever."""
+    with pytest.raises(netkf.EngineError, match=r"must not print \(\S*errors.py, line \d+\): set"):
+        netkf.simulate(ring.replace({"filter": Uncompiled("printing")}), engine=engine)
+
+
+@kernel
+def loud(message, settings, t, out):
+    print("here")
+    out[0] = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Loud(parts.KernelLoss):
+    law = loud
+
+
+@pytest.mark.skipif(is_plain(), reason="nothing is compiled")
+def test_a_law_that_prints_is_refused(ring):
+    with pytest.raises(netkf.EngineError, match=r"must not print \(\S*errors.py, line \d+\)"):
+        netkf.simulate(ring.replace({"network.channel.loss": Loud()}), engine="simpy")
+
+
 def test_kernels_must_take_what_they_are_given(ring):
     with pytest.raises(TypeError, match=r"absorb must take \(record, h, run\), not \(message, out"):
         Kernels(absorb=short)
