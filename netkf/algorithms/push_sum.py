@@ -349,8 +349,8 @@ def correct_root(
         useful = share > ROUNDING * n
         if not any_lane(useful):
             return
-        # v' = remainder[largest] / sqrt(pivot), the next row of the Cholesky factor; zeros, which
-        # change nothing, in lanes whose remainder is rounding.
+        # v' = this row / sqrt(pivot), the next one of the Cholesky factor; zeros, which change
+        # nothing, in lanes whose remainder is rounding.
         scale = select(useful, root_of(pivot), 1.0)
         for i in range(n):
             store(lanes, v, i, select(useful, load(lanes, v, i) / scale, 0.0))

@@ -59,6 +59,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 PRIVATE_OPTIONS = ("no_cfunc_wrapper", "_nrt")
 _OPTIONS: Any = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 _has_frozen = [False]
+"""Whether there were objects that others had frozen (gc.freeze)."""
 _announcing = [False]
 """Whether the next kernel that is compiled is announced."""
 _compile_times: list[float] = []
