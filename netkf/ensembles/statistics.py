@@ -232,7 +232,8 @@ def _quantities(
         runs = (spans[:, 0] == first) & (ends == end)
         part = squares[:, first:end] if runs.all() else squares[runs, first:end]
         # A quantile of all nodes is between samples of all, though one filter stands for them.
-        found[runs] = sample_quantities(scenario, np.repeat(part, copies, axis=2))
+        of_nodes = part if copies == 1 else np.repeat(part, copies, axis=2)
+        found[runs] = sample_quantities(scenario, of_nodes)
     return found if network is None else np.concatenate([found, network], axis=2)
 
 

@@ -64,8 +64,11 @@ def sample_quantities(scenario: Scenario, squares: FloatArray) -> FloatArray:
     if not count:
         return found
     by_node = np.sort(np.moveaxis(squares, -2, -1), axis=-1)
-    pooled = np.sort(by_node.reshape(*runs, 1, nodes * count), axis=-1) if nodes > 1 else by_node
-    for rows, ordered in ((slice(-1), by_node), (slice(-1, None), pooled)):
+    parts = [(slice(None), by_node)]  # one node is all
+    if nodes > 1:
+        pooled = np.sort(by_node.reshape(*runs, 1, nodes * count), axis=-1)
+        parts = [(slice(-1), by_node), (slice(-1, None), pooled)]
+    for rows, ordered in parts:
         # Where a sample is nan, it is the last one, and all quantities are.
         last, part = ordered[..., -1:], found[..., rows, :]
         places = np.array([1.0, *metrics.quantiles]) * (ordered.shape[-1] - 1)
