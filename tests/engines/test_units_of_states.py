@@ -23,13 +23,14 @@ KEYS = {
 def scenario(tmp_path, name, units):
     n, slotted = len(units), name in SLOTS
     kind = name.split()[0]
+    D, inverse = np.diag(units), np.diag(1.0 / units)
     if slotted:
-        plant = {"kind": "linear", "F": units[:, None] * F / units, "period": 0.5}
-        plant["Q"] = units[:, None] * Q * units
+        plant = {"kind": "linear", "F": (D @ F @ inverse).tolist(), "period": 0.5}
+        plant["Q"] = (D @ Q @ D).tolist()
     else:
-        plant = {"kind": "diffusion", "A": units[:, None] * (F - np.eye(n)) / units}
-        plant["B"] = units[:, None] * np.linalg.cholesky(Q)
-    plant["cov"] = np.diag(units**2)
+        plant = {"kind": "diffusion", "A": (D @ (F - np.eye(n)) @ inverse).tolist()}
+        plant["B"] = (D @ np.linalg.cholesky(Q)).tolist()
+    plant["cov"] = (D @ D).tolist()
     sensors = [
         {"nodes": [node], "H": [(row / units).tolist()], "R": [[0.4]]} for node, row in enumerate(H)
     ]
@@ -42,9 +43,7 @@ def scenario(tmp_path, name, units):
         "name": "units",
         "horizon": 6.0,
         "probe": 0.5,
-        "plant": {
-            key: getattr(value, "tolist", lambda v=value: v)() for key, value in plant.items()
-        },
+        "plant": plant,
         "sensors": sensors,
         "network": {
             "graph": {"kind": "path", "nodes": 3},
