@@ -660,8 +660,9 @@ class DerivedScenario(ScenarioModel):
         absolute states, or from what is known where the truth is recorded.
         """
         if self.plant.is_random or self.input_responses is None:
-            # A state that is not known has no coordinates but those of the filters.
-            return np.where(np.isnan(x), 0.0, x - local)
+            # A state that is not known has no coordinates but those of the filters. One that passed
+            # the largest number is not a number either, but it was known in its frame.
+            return np.where(np.isnan(local), 0.0, x - local)
         believed = self.input_responses.believed
         return np.zeros(x.shape) if believed is None else believed.states(times)
 

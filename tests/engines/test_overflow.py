@@ -78,6 +78,23 @@ def test_what_passes_the_largest_number_ends_the_run_and_is_named(case, slotted)
     assert ensemble.runs[np.searchsorted(ensemble.times, run.times[-1])] <= 2
 
 
+@pytest.mark.parametrize("slotted", [False, True])
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_states_that_are_no_numbers_end_the_run_as_well(engine, slotted):
+    """Beyond the largest number two states are infinity less infinity: no number at all."""
+    F, eye = [[3.0, 1.0], [-1.0, 3.0]], np.eye(2).tolist()
+    plant = {"F": F, "Q": eye, "period": 1.0} if slotted else {"A": F, "B": eye}
+    kind = "linear" if slotted else "diffusion"
+    sensor = {"nodes": [0, 1], "H": eye, "R": eye}
+    changes = {"plant": {**plant, "kind": kind, "cov": eye}, "sensors": [sensor], "probe": 100.0}
+    run = netkf.simulate(scenario("local", slotted, 900.0).replace(changes), engine=engine)
+    assert run.status == "diverged"
+    assert np.isnan(run.x[-1]).all()
+    assert np.isfinite(run.x[:-1]).all()
+    assert np.isfinite(run.error).all()
+    assert reason(run) == "the true state passed 1.8e308, the largest number there is,"
+
+
 def test_runs_that_end_in_time_are_complete():
     for slotted in (False, True):
         run = assert_agree(scenario("central", slotted, 600.0))
