@@ -71,16 +71,19 @@ def symmetric(matrices: FloatArray) -> FloatArray:
 
 
 def is_semidefinite(matrix: FloatArray, tolerance: float = 1e-10) -> bool:
-    """Return True if no eigenvalue of a symmetric ``matrix`` (n, n), whose rows have their own
-    units, is below -tolerance, where the diagonal is at most 1.
+    """Return True if no eigenvalue of a symmetric ``matrix`` (n, n) is below -tolerance times its
+    largest, and none below -1e-5 in units of the rows in which the diagonal is 1.
     """
-    sizes = np.diagonal(matrix)
-    largest = np.abs(matrix).max(initial=0.0)
-    # Rows that are rounding of zero beside the largest have no units.
+    values, sizes = np.linalg.eigvalsh(matrix), np.diagonal(matrix)
+    # Relative to the largest eigenvalue; the smallest normal number admits the zero matrix.
+    largest = max(abs(values[-1]), np.finfo(float).tiny)
+    # Rows that are rounding of zero beside it have no units; others may be written in six digits.
     rounding = 1e-13 * largest
-    units = np.sqrt(np.where(sizes > rounding, sizes, largest or 1.0))
-    values = np.linalg.eigvalsh(matrix / units[:, None] / units)
-    return bool((sizes >= -rounding).all() and values[0] >= -tolerance)
+    units = np.sqrt(np.where(sizes > rounding, sizes, largest))
+    in_units = np.linalg.eigvalsh(matrix / units[:, None] / units)
+    return bool(
+        values[0] >= -tolerance * largest and sizes.min() >= -rounding and in_units[0] >= -1e-5
+    )
 
 
 def is_definite(matrices: FloatArray) -> NDArray[np.bool_]:

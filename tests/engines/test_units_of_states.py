@@ -71,6 +71,7 @@ def test_P_is_that_of_other_units(tmp_path, name):
         (np.diag([1e6, -1e-6]), False),  # a variance is negative, in whatever units
         (np.array([[1e6, 1.1], [1.1, 1e-6]]), False),
         (np.array([[1e6, 0.9], [0.9, 1e-6]]), True),
+        (np.array([[1e6, 1.000001], [1.000001, 1e-6]]), True),  # the last of seven digits
         (np.array([[1.0, 1e-17], [1e-17, -1e-18]]), True),  # rounding of zero
         (np.zeros((2, 2)), True),
     ],
