@@ -74,16 +74,18 @@ def is_semidefinite(matrix: FloatArray, tolerance: float = 1e-10) -> bool:
     """Return True if no eigenvalue of a symmetric ``matrix`` (n, n) is below -tolerance times its
     largest, and none below -1e-5 in units of the rows in which the diagonal is 1.
     """
-    values, sizes = np.linalg.eigvalsh(matrix), np.diagonal(matrix)
-    # Relative to the largest eigenvalue; the smallest normal number admits the zero matrix.
-    largest = max(abs(values[-1]), np.finfo(float).tiny)
+    sizes = np.diagonal(matrix)
+    largest = max(float(np.abs(matrix).max()), np.finfo(float).tiny)  # tiny: of the zero matrix
     # Rows that are rounding of zero beside it have no units; others may be written in six digits.
     rounding = 1e-13 * largest
     units = np.sqrt(np.where(sizes > rounding, sizes, largest))
-    in_units = np.linalg.eigvalsh(matrix / units[:, None] / units)
-    return bool(
-        values[0] >= -tolerance * largest and sizes.min() >= -rounding and in_units[0] >= -1e-5
-    )
+    least = np.linalg.eigvalsh(matrix / units[:, None] / units)[0]
+    if sizes.min() < -rounding or not least >= -1e-5:
+        return False
+    if least >= -tolerance:
+        return True  # in units of the largest row too
+    values = np.linalg.eigvalsh(matrix)
+    return bool(values[0] >= -tolerance * abs(values[-1]))
 
 
 def is_definite(matrices: FloatArray) -> NDArray[np.bool_]:
