@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 from bisect import bisect_right
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -84,11 +83,10 @@ def _check_blocks(scenario: DerivedScenario) -> None:
         rule = f"must be the same blocks for all nodes for the {name}, whose messages say no blocks"
         remedy = 'write "all", kind = "block-intersection", or Needs(translate=...) in a class'
         raise ScenarioError("filter.estimates", rule, scenario.filter.estimates, remedy)
+    couplings = [] if needs.coupled else _couplings(scenario)
     for k, node in enumerate(scenario.nodes):
         view = scenario.view(k)
-        others = np.setdiff1d(np.arange(scenario.plant.n), view)
-        couplings: Iterable[FloatArray] = () if needs.coupled else _couplings(scenario)
-        if any(M[np.ix_(view, others)].any() for M in couplings):
+        if any(np.delete(M[view], view, axis=1).any() for M in couplings):
             rule = f"must contain all that drives the blocks of node {node}"
             remedies = ['write kind = "partition"'] if scenario.plant.linear else []
             if not needs.own_blocks:
@@ -115,7 +113,7 @@ def _couplings(scenario: DerivedScenario) -> list[FloatArray]:
     """Return matrices (n, n) by which blocks drive each other, as filters believe."""
     plant: Any = scenario.plant
     if not plant.linear:
-        return [plant.f.coupling]
+        return [plant.f.coupling] if plant.f.coupling.any() else []
     return [M for M, _ in scenario.believed_pieces]
 
 
