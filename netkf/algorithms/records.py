@@ -196,8 +196,9 @@ class Kernels:
     def __post_init__(self) -> None:
         """Raise TypeError for a verb that is no kernel, or takes other arguments."""
         for name in VERBS:
-            verb = getattr(self, name)
-            due = getattr(type(self), name)
+            verb, due = getattr(self, name), getattr(type(self), name)
+            if verb is due:
+                continue
             names = inspect.signature(inspect.unwrap(getattr(due, "loops", due))).parameters
             if problem := kernel_problem(verb, [*names]):
                 raise TypeError(f"Kernels.{name} {problem}")
