@@ -98,17 +98,7 @@ def read_mrclam(folder: Path) -> tuple[dict[str, str], tuple[str, ...]]:
     readings = _name_subjects(files["Measurement"], subjects, {*nodes, *points}, notes)
     tables = {"odometry.csv": files["Odometry"], "truth.csv": files["Groundtruth"]}
     poses = {node: rows for node, rows in tables["truth.csv"].groupby("node")}  # noqa: C416
-    # All poses are known from the last beginning to the first end.
-    last = max(nodes, key=lambda node: float(poses[node]["t"].iloc[0]))
-    first = min(nodes, key=lambda node: float(poses[node]["t"].iloc[-1]))
-    origin, end = poses[last]["t"].iloc[0], poses[first]["t"].iloc[-1]
-    horizon = int(float(end) - float(origin))
-    if horizon < 1:
-        rule = "must have true poses of all robots for a second or longer"
-        got = f"robot {last} from {origin} on, robot {first} until {end}"
-        raise ScenarioError(
-            str(folder), rule, got, "check the stamps, or leave a robot's files out"
-        )
+    origin, horizon = _span_of_all(folder, poses)
     start = np.array([float(origin)])
     means = [np.round(_poses_at(poses[node], start)[0], 6).tolist() for node in nodes]
     log = re.sub(r"[^\w.-]", "_", folder.resolve().name)
@@ -132,6 +122,20 @@ def read_mrclam(folder: Path) -> tuple[dict[str, str], tuple[str, ...]]:
     # The numbers stay as they are written in the log.
     texts = {path: _by_time(table).to_csv(index=False) for path, table in tables.items()}
     return {"scenario.toml": "".join(parts), **texts}, tuple(notes)
+
+
+def _span_of_all(folder: Path, poses: dict[Any, pd.DataFrame]) -> tuple[str, int]:
+    """Return the stamp from which on poses of all robots are known, and for how many seconds."""
+    last = max(poses, key=lambda node: float(poses[node]["t"].iloc[0]))
+    first = min(poses, key=lambda node: float(poses[node]["t"].iloc[-1]))
+    origin, end = poses[last]["t"].iloc[0], poses[first]["t"].iloc[-1]
+    horizon = int(float(end) - float(origin))
+    if horizon < 1:
+        rule = "must have true poses of all robots for a second or longer"
+        got = f"robot {last} from {origin} on, robot {first} until {end}"
+        remedy = "check the stamps, or leave a robot's files out"
+        raise ScenarioError(str(folder), rule, got, remedy)
+    return origin, horizon
 
 
 def _read(path: Path, columns: Sequence[str]) -> pd.DataFrame:
