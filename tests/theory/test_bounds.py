@@ -9,6 +9,7 @@ import scipy.linalg
 
 import netkf
 from netkf import theory
+from netkf.theory.hybrid import bounds
 
 
 def plain_bound(A, Q, G, c, P0, times):
@@ -99,6 +100,26 @@ def test_a_fixed_delay_enters_as_the_predicted_past(build):
     steady = theory.steady_covariance_bound(scenario)
     far = theory.covariance_bound(scenario, [40.0])[0]
     np.testing.assert_allclose(steady, far, rtol=1e-8)
+
+
+def test_samples_and_late_messages_by_series_as_by_an_implicit_method(build, monkeypatch):
+    """Jumps at instants that no multiple of the delay meets, beside what arrives by clocks."""
+    sampling = {"kind": "periodic", "period": 0.31}
+    sensor = {"H": [[1.0, 0.5]], "R": [[0.2]]}
+    scenario = build(
+        plant={"kind": "diffusion", "A": [[-0.2, 1.0], [-1.0, 0.1]], "B": [[0.3], [1.0]]},
+        sensors=[{"nodes": [0], **sensor, "sampling": sampling}, {"nodes": [1], **sensor}],
+        network={
+            "graph": {"kind": "path", "nodes": 3},
+            "activation": {"kind": "poisson", "rate": 2.0},
+            "channel": {"delay": {"kind": "constant", "seconds": 0.25}},
+        },
+        filter={"kind": "hybrid", "epsilon": 0.4},
+    )
+    times = [0.1, 0.31, 0.56, 0.9, 1.24, 3.0]
+    series = theory.covariance_bound(scenario, times)
+    monkeypatch.setattr(bounds, "MAX_EXPLICIT_EVALUATIONS", 0)
+    np.testing.assert_allclose(theory.covariance_bound(scenario, times), series, rtol=2e-7)
 
 
 def test_a_precise_sensor_hears_late_of_large_covariances(build):

@@ -12,8 +12,8 @@ import bisect
 import contextlib
 import itertools
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -42,6 +42,8 @@ PARTS = (1, 40, 400)  # try after try, a step of the solver lasts at most a piec
 Slope = Callable[[float, FloatArray], FloatArray]
 """dy/dt of the flat packed solution y, from t (seconds) and y."""
 
+_ORDERS = np.arange(ORDER + 1)
+_BINOMIAL = np.array([[math.comb(j, k) for j in range(ORDER + 1)] for k in range(ORDER + 1)], float)
 # Exact for polynomials of degree 9.
 _GAUSS, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(5)
 
@@ -113,40 +115,98 @@ def _solve_coupled(packed: PackedRiccati, times: FloatArray) -> FloatArray:
 
 def _solve_by_taylor_series(packed: PackedRiccati, times: FloatArray) -> FloatArray:
     """Return the packed bound (T, N, m) without delays and samples; StiffError if it takes long."""
+    bound = np.empty((len(times), *packed.start.shape))
+    count = int(np.searchsorted(times, 0.0, side="right"))
+    bound[:count] = packed.start
+    for step in _taylor_steps(packed, packed.start, 0.0, float(times[-1])):
+        until = int(np.searchsorted(times, step.end, side="right"))
+        bound[count:until] = step.at(times[count:until])
+        count = until
+    return bound
+
+
+class _TaylorStep(NamedTuple):
+    """A step of a solution by Taylor series.
+
+    start, end : seconds
+    span       : seconds that are 1 in the polynomials
+    series     : (ORDER + 1, N, m) coefficients, from ``start``
+    """
+
+    start: float
+    end: float
+    span: float
+    series: FloatArray
+
+    def at(self, times: FloatArray) -> FloatArray:
+        """Return the packed solution (T, N, m) at ``times`` (T,), seconds."""
+        powers = ((times - self.start) / self.span)[:, None] ** _ORDERS
+        return np.tensordot(powers, self.series, 1)
+
+    def moved(self, start: float, span: float) -> FloatArray:
+        """Return the coefficients of the same polynomials from ``start`` in ``span`` seconds."""
+        x, scale = (start - self.start) / self.span, span / self.span
+        powers = x ** np.maximum(_ORDERS - _ORDERS[:, None], 0) * scale ** _ORDERS[:, None]
+        return np.tensordot(_BINOMIAL * powers, self.series, 1)
+
+
+class _TaylorSeries:
+    """A solution over successive steps by Taylor series; as a function, flat (N m,) at a time."""
+
+    def __init__(self, steps: Iterator[_TaylorStep]) -> None:
+        self._steps = list(steps)
+        self._ends = [step.end for step in self._steps]
+
+    def step_at(self, t: float) -> _TaylorStep:
+        """Return the step at ``t`` (seconds); the last one also after its end."""
+        return self._steps[min(bisect.bisect_right(self._ends, t), len(self._steps) - 1)]
+
+    def __call__(self, t: float) -> FloatArray:
+        return self.step_at(t).at(np.array([t])).reshape(-1)
+
+
+def _taylor_steps(
+    packed: PackedRiccati,
+    Y: FloatArray,
+    now: float,
+    last: float,
+    sent: Callable[[float], _TaylorStep] | None = None,
+) -> Iterator[_TaylorStep]:
+    """Yield the steps from ``Y`` (N, m) at ``now`` to ``last``, in seconds; StiffError if they get
+    too many. ``sent`` returns the step of the solution a delay before a time, as if it were now.
+    """
     # The right-hand side is quadratic, so that a coefficient of any order costs about one
     # evaluation (Moore 1966; Barton, Willers and Zahar 1971).
-    scale, orders, evaluations = _covariance_scale(packed), np.arange(ORDER + 1), 0
-    Y, now, last = packed.start, 0.0, float(times[-1])
-    samples = np.empty((len(times), *Y.shape))
-    count = int(np.searchsorted(times, 0.0, side="right"))
-    samples[:count] = Y
+    scale, evaluations = _covariance_scale(packed), 0
+
+    def late(t: float) -> FloatArray | None:
+        return None if sent is None else sent(t).at(np.array([t]))[0]
+
     # Time is measured in spans, over which the solution changes by about its own size.
-    span = float(np.abs(Y).max() + scale) / max(float(np.abs(packed.slope(Y)).max()), 1e-300)
-    while count < len(times):
+    slope = float(np.abs(packed.slope(Y, late(now))).max())
+    span = float(np.abs(Y).max() + scale) / max(slope, 1e-300)
+    while now < last:
         evaluations += ORDER
         span = min(span, last - now)
-        series = packed.series(Y, span, ORDER)
+        arriving = None if sent is None else sent(now).moved(now, span)
+        series = packed.series(Y, span, ORDER, arriving)
         shares = (np.abs(series[-2:]).max(axis=2) / (np.abs(Y).max(axis=1) + FLOOR * scale)).max(1)
-        lengths = (TERM_TOLERANCE / np.maximum(shares, 1e-300)) ** (1.0 / orders[-2:])
+        lengths = (TERM_TOLERANCE / np.maximum(shares, 1e-300)) ** (1.0 / _ORDERS[-2:])
         step = min(float(lengths.min()), (last - now) / span)
         while True:  # until the polynomial satisfies the equation at the end
             if evaluations > MAX_EXPLICIT_EVALUATIONS or not step > MIN_STEP:
                 raise StiffError
             end = last if step * span >= last - now else now + step * span
-            until = int(np.searchsorted(times, end, side="right"))
-            fractions = np.append((times[count:until] - now) / span, step)
-            solution = np.tensordot(fractions[:, None] ** orders, series, 1)
-            derivative = np.tensordot(orders[1:] * step ** orders[:-1], series[1:], 1)
-            defect = step * np.abs(derivative - span * packed.slope(solution[-1])).max(axis=1)
-            sizes = np.abs(solution[-1]).max(axis=1) + FLOOR * scale
-            if (defect <= SERIES_TOLERANCE * sizes).all():
+            Y = np.tensordot(step**_ORDERS, series, 1)
+            derivative = np.tensordot(_ORDERS[1:] * step ** _ORDERS[:-1], series[1:], 1)
+            defect = step * np.abs(derivative - span * packed.slope(Y, late(end))).max(axis=1)
+            if (defect <= SERIES_TOLERANCE * (np.abs(Y).max(axis=1) + FLOOR * scale)).all():
                 break
             step *= 0.7
-        samples[count:until] = solution[:-1]
-        Y, now, span, count = solution[-1], end, step * span, until
         if not np.abs(Y).max() < OVERFLOW:
-            raise TheoryError(f"Tanwani's H(12) grows beyond {OVERFLOW:g} before {now:g} s")
-    return samples
+            raise TheoryError(f"Tanwani's H(12) grows beyond {OVERFLOW:g} before {end:g} s")
+        yield _TaylorStep(now, end, span, series)
+        now, span = end, step * span
 
 
 def _covariance_scale(packed: PackedRiccati) -> float:
@@ -186,6 +246,7 @@ class _PiecewiseSolution:
     _start_value        : (N, m) the solution where the next piece begins
     _values_after_jumps : by time, the solution (N, m) just after it jumps
     _without_arrivals   : the equations until the first message has taken the delay
+    _by_series          : whether Taylor series have solved every piece so far
     """
 
     def __init__(self, packed: PackedRiccati) -> None:
@@ -197,6 +258,8 @@ class _PiecewiseSolution:
         silent = equations._replace(coupling=0.0 * equations.coupling, samples=quiet)
         self._without_arrivals = PackedRiccati(silent)
         self._jumps = _SampleJumps(packed)
+        # Rates of samples are no polynomials. Without jumps series have found the equations stiff.
+        self._by_series = not equations.samples and (equations.delay > 0.0 or bool(equations.jumps))
         self._start_value = packed.start
         self._values_after_jumps: dict[float, FloatArray] = {}
         self._piece_ends: list[float] = [0.0]
@@ -210,8 +273,10 @@ class _PiecewiseSolution:
         if t in self._values_after_jumps:
             return self._values_after_jumps[t]
         # t may exceed the last end by a rounding error.
-        piece = min(int(np.searchsorted(self._piece_ends, t)), len(self._outputs)) - 1
-        return self._outputs[piece](t).reshape(start.shape)
+        return self._outputs[self._piece_at(t)](t).reshape(start.shape)
+
+    def _piece_at(self, t: float) -> int:
+        return min(int(np.searchsorted(self._piece_ends, t)), len(self._outputs)) - 1
 
     def extend(self, last: float) -> None:
         """Integrate H(12) up to time ``last`` (seconds), and append the pieces of its solution."""
@@ -293,6 +358,11 @@ class _PiecewiseSolution:
         self, begin: float, end: float, slope: Slope, growth: float = math.inf
     ) -> tuple[Callable[[float], FloatArray], float]:
         """Return the solution from ``begin`` and its last time: ``end``, or at ``growth``."""
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):
+                return self._expand(begin, end), end
+        except StiffError:
+            self._by_series = False
         first_error: TheoryError | None = None
         for step_count in PARTS:  # shorter steps reduce the error of the dense output between them
             max_step = (end - begin) / step_count if step_count > 1 else np.inf
@@ -313,6 +383,28 @@ class _PiecewiseSolution:
             return output, float(result.t[-1])
         assert first_error is not None
         raise first_error
+
+    def _expand(self, begin: float, end: float) -> _TaylorSeries:
+        """Return the solution from ``begin`` to ``end`` by Taylor series; raises StiffError."""
+        delay, inside = self._packed.equations.delay, 1e-9 * (end - begin)
+        if not self._by_series or 0.0 < delay * (1.0 + 1e-12) < end - begin:
+            raise StiffError
+
+        def sent(t: float) -> _TaylorStep:
+            # What was sent at a jump is that before it at the end of a piece, else that after it.
+            past = min(max(t, begin + inside), end - inside) - delay
+            output = self._outputs[self._piece_at(past)]
+            assert isinstance(output, _TaylorSeries)
+            step = output.step_at(past)
+            return step._replace(start=step.start + delay, end=step.end + delay)
+
+        if delay == 0.0:
+            steps = _taylor_steps(self._packed, self._start_value, begin, end)
+        elif begin < delay * (1.0 - 1e-12):  # nothing has arrived yet
+            steps = _taylor_steps(self._without_arrivals, self._start_value, begin, end)
+        else:
+            steps = _taylor_steps(self._packed, self._start_value, begin, end, sent)
+        return _TaylorSeries(steps)
 
     def _integrate_piece(
         self, begin: float, end: float, slope: Slope, max_step: float, growth: float

@@ -147,8 +147,12 @@ class PackedRiccati:
             )
         return np.asarray(change)
 
-    def series(self, Y: FloatArray, span: float, order: int) -> FloatArray:
-        """Return Taylor coefficients (order + 1, N, m) in seconds / ``span``, without delays."""
+    def series(
+        self, Y: FloatArray, span: float, order: int, sent: FloatArray | None = None
+    ) -> FloatArray:
+        """Return Taylor coefficients (order + 1, N, m) in seconds / ``span``, without samples;
+        ``sent`` are those of Y a delay ago, Y itself if None.
+        """
         series = np.empty((order + 1, *Y.shape))
         series[0] = Y
         # Coefficient k of P G P is the sum over i of (P_i G) P_k-i, one product of block matrices:
@@ -156,7 +160,12 @@ class PackedRiccati:
         sensed, n = len(self._sensed), len(self.equations.A)
         gains, P = np.empty((sensed, n, order, n)), np.empty((sensed, order, n, n))
         for k in range(order):
-            change = self._exchange @ series[k] + series[k] @ self._drift_map
+            change = series[k] @ self._drift_map
+            if sent is None:
+                change += self._exchange @ series[k]
+            else:
+                arriving = self.predict(sent[k]) if k == 0 else sent[k] @ self._predicted
+                change += self.equations.coupling @ arriving - self.leaving[:, None] * series[k]
             if k == 0:
                 change += self._Q
             P[:, order - 1 - k] = present = self.unpack(series[k, self._sensed])
