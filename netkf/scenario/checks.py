@@ -88,8 +88,9 @@ def _check_times(scenario: DerivedScenario) -> None:
         raise ScenarioError("plant.period", rule, scenario.slot_plant.period, remedy)
     if not isinstance(probe, np.ndarray):
         if probe > horizon:
+            remedy = "shorten the period, or list times, as probe = [0.0]"
             raise ScenarioError(
-                "probe", f"must be at most the horizon {horizon:.15g}", probe, "shorten the period"
+                "probe", f"must be at most the horizon {horizon:.15g}", probe, remedy
             )
         if horizon / probe > MAX_SAMPLES:
             rule = f"must ask for at most {MAX_SAMPLES:,} samples"

@@ -468,6 +468,8 @@ def _judge_block(
     width = excess - low if excess > 0.0 else high - excess
     if not any(run.covariance_given[0] for run in runs):
         verdict = NO_COVARIANCE
+    elif not len(means):
+        verdict = "no NEES: no sample after time 0"
     elif np.isfinite(min(run.blurred_from[0] for run in runs)) and np.isnan(nees).any():
         verdict = UNDECIDED
     else:

@@ -400,9 +400,12 @@ def format_innovations(tests: InnovationTests, full: bool = True) -> str:
     # Where readings are too few nothing can be found.
     judged = [row for row in tests.rows if math.isfinite(row.nis_detectable + row.bias_detectable)]
     if tests.law.kind and judged:
-        largest = [max(getattr(row, name) for row in judged) for name in DETECTABLE]
+        # Correlations are not tested where readings are very few.
+        values = [[getattr(row, name) for name in DETECTABLE] for row in judged]
+        largest = np.fmax.reduce(values).tolist()
         text = "found with probability 0.9 at every node judged: a mean NIS of {:.3g}, a bias of {}"
-        text += ", a correlation at one lag of {:.3g}" * (tests.law.kind == "white")
+        white = tests.law.kind == "white" and math.isfinite(largest[2])
+        text += ", a correlation at one lag of {:.3g}" * white
         # Biases of different units do not compare.
         found = sorted((row.label, row.bias_detectable) for row in judged)
         largest[1] = ", ".join(f"{b:.3g}" + f" in {of}" * bool(of) for of, b in dict(found).items())

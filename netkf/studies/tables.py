@@ -107,7 +107,7 @@ def format_consistency(consistency: Consistency, full: bool = True) -> str:
             *[row.block] * of_blocks,
             format_number(row.nees) + (f" +- {row.width:.1g}" if math.isfinite(row.width) else ""),
             format_number(row.expected),
-            f"{row.inside:.0%}",
+            f"{row.inside:.0%}" if math.isfinite(row.inside) else "-",
             format_number(row.nis),
             format_number(row.expected_nis),
             row.verdict,

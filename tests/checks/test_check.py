@@ -269,6 +269,15 @@ def test_filters_that_hear_nobody_are_held_to_their_equations(kind, table, tmp_p
     assert not any("messages" in promise for promise in rows)
 
 
+def test_networks_without_links_have_no_row_about_them(tmp_path):
+    alone = {"kind": "edges", "edges": [], "nodes": [0]}
+    table = {**GOSSIP, "network": {**GOSSIP["network"], "graph": alone}}
+    table["sensors"] = GOSSIP["sensors"][:1]
+    found = check(scenario_of(table, tmp_path), runs=10, workers=1)
+    assert found
+    assert not any("paired" in row.promise for row in found.rows)
+
+
 def test_a_central_filter_that_is_too_sure_is_caught(tmp_path):
     filtering = {"kind": "tests.checks.broken:TooSureOfAll"}
     broken = broken_promises(scenario_of(GOSSIP, tmp_path, filter=filtering), 20)

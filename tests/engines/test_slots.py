@@ -181,6 +181,28 @@ def test_what_arrives_after_the_inbox_closed_is_late_and_lost(tmp_path):
         np.testing.assert_allclose(run.P[k + 1, 1], expected, rtol=1e-12)
 
 
+@pytest.mark.parametrize("kind", ["hcmci", "intermittent"])
+@pytest.mark.parametrize("horizon", [2.2, 2.5])
+def test_a_horizon_within_an_exchange_lets_it_end(kind, horizon, tmp_path):
+    """What arrives as the inbox closes, after the horizon, is in the sample and in the trace."""
+    network = {
+        "graph": {"kind": "path", "nodes": 2},
+        "activation": {"kind": "broadcast"},
+        "channel": {"delay": {"kind": "constant", "seconds": 0.5}},
+    }
+    sensors = [{"nodes": [0], "H": [[1.0]], "R": [[1.0]]}]
+    arguments = ([[0.9]], [[1.0]], [[1.0]], sensors, network, kind)
+    whole = slotted(tmp_path, 3, *arguments)
+    cut = whole.replace({"horizon": horizon, "probe": [0.0, 1.0, 2.0]})
+    runs = [netkf.simulate(cut, engine=engine) for engine in ("simpy", "compiled")]
+    assert netkf.first_difference(*runs) is None
+    expected = netkf.simulate(whole)
+    assert (runs[0].events.kind == "absorb").sum() == (runs[0].events.kind == "deliver").sum()
+    np.testing.assert_allclose(runs[0].P, expected.P[:3], rtol=1e-12)
+    exact = [theory.error_covariance(*pair) for pair in ((cut, runs[0]), (whole, expected))]
+    np.testing.assert_allclose(exact[0], exact[1][:3], rtol=1e-12)
+
+
 @pytest.mark.parametrize("engine", ["simpy", "compiled"])
 def test_what_comes_while_a_later_exchange_is_open_is_late(tmp_path, engine):
     """Node 1 hears node 0 after 0.1 s and node 2 after 0.2 s, and is heard a slot later."""

@@ -412,6 +412,11 @@ def test_runs_in_which_a_node_reads_nothing_do_not_hide_its_innovations(ring):
     assert np.isnan(found.table["nis"][3:]).all()
 
 
+def test_runs_of_one_sample_at_time_0_say_so(ring):
+    found = netkf.consistency(ring.replace({"probe": [0.0]}), runs=10, workers=1)
+    assert set(found.table["verdict"]) == {"no NEES: no sample after time 0"}
+
+
 def test_messages_of_few_bits_leave_nis_to_be_judged():
     """Predictions are those of the trace: their NIS follows from errors, P and readings."""
     few = netkf.load(

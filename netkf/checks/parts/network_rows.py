@@ -191,7 +191,7 @@ def _clock_promises(clocks: JudgedClocks, samples: PartSamples) -> list[Promise]
 def pair_probabilities(scenario: Scenario) -> FloatArray | None:
     """Return the probability (L,) of each link to be in a matching; None if unknown."""
     stated = stated_part(scenario.network.activation, "slot activation")
-    if not isinstance(stated, Matching):
+    if not isinstance(stated, Matching) or not scenario.topology.links:
         return None
     try:
         mean = stated.mean(scenario.topology)

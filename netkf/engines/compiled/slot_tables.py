@@ -411,9 +411,9 @@ class SlotTables:
         delay = self._grid.snap(self._delays(uses, number, begin) + self._waits(uses, times))
         arrival, receiver = self._grid.snap(begin + delay), self._receiver[w]
         lost, absorbed = np.isnan(delay), arrival <= closes
-        # Of messages that take time all that arrive before the horizon are recorded.
-        in_time = arrival < self._scenario.horizon
-        is_recorded = np.where(arrival > begin, in_time, times.recorded[uses.slot])
+        # What arrives before the horizon is recorded, and what comes in time in a recorded slot.
+        is_recorded = (arrival < self._scenario.horizon) & (arrival > begin)
+        is_recorded |= times.recorded[uses.slot] & ~(arrival > closes)
         outcome = np.where(absorbed, DELIVER, LATE)
         if self._scenario.network.lives:
             lost |= self.lives.is_down(receiver, arrival)

@@ -104,7 +104,10 @@ class Transmitter:
         # along with an input, and when its estimate is of.
         self.origin_at: Callable[[int, float], FloatArray] | None = None
         self.estimates_at: Callable[[int], float]
-        self._horizon, self._until = scenario.horizon, scenario.end_time
+        # A slot that begins before the horizon is recorded to the end of its exchanges.
+        self._horizon, self._until = scenario.horizon, scenario.horizon
+        if scenario.slotted:
+            self._until += scenario.slot_plant.period
         self._instant = scenario.time_grid.instant
         # Of nodes that move: who hears whom. Set when the true state of the run is known.
         self.reach: Reach | None = None
@@ -201,13 +204,14 @@ class Transmitter:
             envelope = self._stamped(direction.link, envelope)
         else:
             envelope = envelope._replace(age=age)
+        arrives_in_time = direction.receiver.in_time(envelope)
+        # In slots what comes in time is recorded after the horizon too, as its exchange is.
+        is_recorded = now < self._horizon or arrives_in_time
         if not self.up(receiver):
-            if now < self._horizon or envelope.sent == now:
+            if is_recorded:
                 self._recorder.append((now, LOST, sender, receiver, envelope.number, phase, NAN))
             return
-        arrives_in_time = direction.receiver.in_time(envelope)
-        # After the horizon the last slot is finished for its sample, without recording events.
-        if now < self._horizon or envelope.sent == now:
+        if is_recorded:
             kind, number = DELIVER if arrives_in_time else LATE, envelope.number
             self._recorder.append((now, kind, receiver, sender, number, phase, age))
         if arrives_in_time:
