@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.filter import takes_columns
+from netkf.algorithms.filter import compiled_kernels, takes_columns
 from netkf.algorithms.registry import built_in_class, overridden
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
@@ -164,6 +164,10 @@ def require_errors(scenario: Scenario) -> None:
         raise TheoryError(f"{rule}, not of those that give increments; {CONSISTENCY}")
     if scenario.links_follow_state and scenario.node_filter.timing.talks:
         raise TheoryError("the true state says who hears whom: events tell of it")
+    kernels = compiled_kernels(scenario.node_filter, clocked=True)
+    is_kalman = kernels.is_kalman if kernels else not takes_columns(scenario.node_filter)
+    if not scenario.slotted and scenario.increment_sensors and not is_kalman:
+        raise TheoryError("the exact errors of this filter are known for sampled sensors")
 
 
 def require_known_filter(scenario: Scenario) -> None:

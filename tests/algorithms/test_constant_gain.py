@@ -110,6 +110,15 @@ def test_gains_that_vary_beat_constant_ones_on_the_same_ticks(ring):
     assert np.trace(ours.P - best.P, axis1=2, axis2=3).max() > 0.05
 
 
+def test_check_of_increments_says_that_their_exact_errors_are_not_known(ring):
+    """It refused the scenario: what is not known was asked for to count the runs to replay."""
+    constant = {"kind": "constant-gain", "gain": [[0.3], [0.1]]}
+    scenario = ring.replace({"horizon": 1.0, "filter": constant})
+    table = netkf.check(scenario, runs=10).table.set_index("promise")
+    row = table.loc["errors have the covariance that the equations give them"]
+    assert row.verdict == "not promised"
+
+
 def test_gains_that_do_not_fit_are_refused(tmp_path):
     for gain, words in (
         (GAINS[:3], r"filter\.gain: must be one matrix, or one for each of 5 nodes; got '3"),

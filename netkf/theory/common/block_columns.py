@@ -16,7 +16,6 @@ import numpy as np
 from netkf.algorithms.filter import Exchange, Message, PairReading, Reading
 from netkf.algorithms.models import ChangingFlowModel, ChangingSlotModel, SlotModel
 from netkf.algorithms.translation import Common, state_before
-from netkf.core.errors import TheoryError
 from netkf.engines.simpy.nodes import View
 from netkf.engines.simpy.slots import SlotSchedule, Stage
 from netkf.linalg.arrays import FloatArray, block_diagonal, square_root
@@ -25,7 +24,6 @@ from netkf.scenario.scenario import Scenario
 from netkf.theory.common.arrivals import Step, arrivals_in_slots
 from netkf.theory.common.columns import ErrorColumns, LoggedColumns
 from netkf.theory.common.forms import MEAN, NOISE
-from netkf.theory.common.increments import KNOWN_OF_SAMPLES
 from netkf.theory.common.kernel_columns import KernelColumns
 from netkf.theory.common.observations import Observation, slot_observations, timed_observations
 from netkf.trace.nees import without_padding
@@ -244,8 +242,6 @@ class ClockBlocks(BlockColumns, LoggedColumns):
 
     def __init__(self, scenario: Scenario, run: Run) -> None:
         super().__init__(scenario, run)
-        if scenario.increment_sensors:
-            raise TheoryError(KNOWN_OF_SAMPLES)
         self._samples = timed_observations(scenario, Streams(run.seed, run.replica), _apart)
         self._now, self._times = 0.0, [0.0] * self.estimators
         plant = cast(Any, scenario.plant)

@@ -12,15 +12,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.filter import compiled_kernels
-from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, IntArray, square_root
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.forms import MEAN, Forms
 from netkf.theory.common.observations import increment_observations
 from netkf.theory.numerics.prediction import NODES, WEIGHTS, ErrorFlow, StateFlow
-
-KNOWN_OF_SAMPLES = "the exact errors of this filter are known for sampled sensors"
 
 
 class IncrementFlows(NamedTuple):
@@ -128,9 +124,6 @@ def increment_flows(scenario: Scenario, estimators: int, piece: int = 0) -> Incr
     observations = increment_observations(scenario)
     if not any(len(observation.H) for observation in observations):
         return None
-    kernels = compiled_kernels(scenario.node_filter, clocked=True)
-    if kernels and not kernels.is_kalman:
-        raise TheoryError(KNOWN_OF_SAMPLES)
     believed, true = scenario.believed_pieces, scenario.diffusion.pieces[piece]
     A, Q = believed[min(piece, len(believed) - 1)]
     plant = true.A, true.B
