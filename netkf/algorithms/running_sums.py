@@ -40,7 +40,7 @@ import numpy as np
 from netkf.algorithms.filter import NodeInfo
 from netkf.algorithms.kernels.estimates import add_covariance_product
 from netkf.algorithms.kernels.intersection import invert_lanes
-from netkf.algorithms.kernels.root_flow import cell_of, transition_series
+from netkf.algorithms.kernels.root_flow import cell_of, transition_series, transitions_at
 from netkf.algorithms.kernels.run import predict_estimate, shift_vector, use_reading
 from netkf.algorithms.kernels.square_root import triangularise
 from netkf.algorithms.modes import RateGroups, rate_groups
@@ -108,16 +108,17 @@ def _table_of(groups: RateGroups) -> tuple[float, FloatArray]:
     """Return the length of a cell (s), and Taylor coefficients (CELLS, terms, n n + G)."""
     kept, rates, terms = groups.kept, groups.rates, len(ORDER_9) + 1
     norm = max(np.abs(balance(kept)[0]).sum(axis=1).max(), rates.max(initial=0.0), 1e-12)
-    unit, n = 2.0 ** np.floor(np.log2(REACH / norm)), len(kept)
+    unit = 2.0 ** np.floor(np.log2(REACH / norm))
     middles = unit * (np.arange(CELLS) + 0.5)
     middles[0] = 0.0
-    M = transition_series(-kept, np.zeros((n, n)), np.zeros((0, n)), middles)[0]
+
+    def series(drift: FloatArray) -> FloatArray:
+        model = -drift, np.zeros(drift.shape), np.zeros((0, len(drift)))
+        return np.asarray(transition_series(*model, transitions_at(*model, middles), terms)[0])
+
     # A plant of one state for each rate: powers of one number.
-    fading = [
-        transition_series(-np.eye(1) * rate, np.zeros((1, 1)), np.zeros((0, 1)), middles)[0]
-        for rate in rates
-    ]
-    parts = [part[:, :terms].reshape(CELLS, terms, -1) for part in (M, *fading)]
+    parts = [series(kept), *(series(np.eye(1) * rate) for rate in rates)]
+    parts = [part.reshape(CELLS, terms, -1) for part in parts]
     return float(unit), np.concatenate(parts, axis=2).astype(np.float64)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 from typing import Any
 
 from netkf.core.printable import one_line
@@ -22,6 +21,8 @@ class NotebookTable:
         return getattr(self, "table", None)
 
     def _repr_html_(self) -> str:
+        import html
+
         line = f"<p><code>{html.escape(one_line(repr(self)))}</code></p>"
         table, rows = self._notebook_table(), ""
         if table is not None:

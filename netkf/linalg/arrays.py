@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import numbers
+import sys
 from collections.abc import Sequence
 from functools import cache
 from typing import Any
@@ -58,7 +59,8 @@ def real_numbers(value: ArrayLike) -> FloatArray:
     is_real = array.dtype.kind in "biuf"
     if array.dtype.kind == "O":
         is_real = all(isinstance(number, numbers.Number) for number in array.flat)
-    if not is_real or np.ma.is_masked(value):
+    # There is no masked array before numpy.ma is imported, which takes 10 ms.
+    if not is_real or ("numpy.ma" in sys.modules and np.ma.is_masked(value)):
         raise TypeError(f"no real numbers: {array.dtype}")
     return np.asarray(array, dtype=np.float64)
 

@@ -142,16 +142,15 @@ def _if_numba_can(step: Callable[..., None], *args: Any) -> None:
 @cache
 def _configure_numba() -> None:
     """Import numba without the settings in the current folder, which may be anyone's."""
-    is_told = "numba" not in sys.modules and os.path.isfile(".numba_config.yaml")
-    yaml = sys.modules.get("yaml")
-    if is_told:
-        sys.modules["yaml"] = None  # type: ignore[assignment] # numba then cannot read the file
+    is_new, yaml = "numba" not in sys.modules, sys.modules.get("yaml")
+    if is_new:
+        sys.modules["yaml"] = None  # type: ignore[assignment] # numba reads only settings with it
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             config: Any = import_module("numba.core.config")
     finally:
-        if is_told:
+        if is_new:
             sys.modules.pop("yaml")
             sys.modules.update({"yaml": yaml} if yaml is not None else {})
     # It is looked for again whenever something is compiled.

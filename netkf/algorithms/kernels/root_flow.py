@@ -165,19 +165,20 @@ def flow_table(
     octaves = max(1, min(CELLS, CELL_BYTES // (8 * CELL_TERMS * width))).bit_length() - 1
     middles = unit * (np.arange(2 ** min(octaves, count - 1)) + 0.5)
     middles[0] = 0.0
-    E, F, Q_g, G = transition_series(A, Q, whitened_H, middles)
-    blocks, bound = information_blocks(whitened_H, F[0], unit)
+    starts = transitions_at(A, Q, whitened_H, middles)
+    first = transition_series(A, Q, whitened_H, starts[:, :1])
+    E, F, Q_g = first[:3, 0]
+    blocks, bound = information_blocks(whitened_H, F, unit)
     # The reach comes first: a table that is padded to a common width still has it there.
     gamma = [np.roll(with_reach(block.astype(np.float64), unit), 1, axis=1) for block in blocks]
-    levels = double_levels(E[0], F[0], Q_g[0], blocks, scale, unit, count)
+    levels = double_levels(E, F, Q_g, blocks, scale, unit, count)
     # No cell lies beyond the longest level.
     octaves = min(octaves, len(levels) - 1)
-    E, F, Q_g, G = (part[: 2**octaves] for part in (E, F, Q_g, G))
-    cell_series = pack_series(E, F, Q_g, G, len(whitened_H) > 0)
     # From its middle a cell reaches half a unit, but the first one reaches a whole unit.
-    series = np.stack(
-        [with_reach(cell, unit if k == 0 else 0.5 * unit) for k, cell in enumerate(cell_series)]
-    )
+    cells = [with_reach(pack_series(first, len(whitened_H) > 0)[0], unit)]
+    if octaves > 0:
+        cells += later_cells(A, Q, whitened_H, starts[:, 1 : 2**octaves], 0.5 * unit)
+    series = np.stack(cells)
     series, reach = series[:, :, :-1], series[:, :, -1]
     # Drop the terms that no gap in any cell needs.
     last_term = max(int(np.searchsorted(row[:-1], row[:-1].max(initial=0.0))) for row in reach)
@@ -197,21 +198,41 @@ def flow_table(
     )
 
 
-def pack_series(
-    E: FloatArray, F: FloatArray, Q_g: FloatArray, G: FloatArray, observed: bool
-) -> FloatArray:
-    """Return the series (C, terms, width) of a FlowTable for C cells from those of exp(A g) =
-    ``E``, ``F``, ``Q_g`` and G_g = ``G``, (C, terms, n, n) each: one row for each term, without F
-    and G_g unless something is ``observed``.
+def later_cells(
+    A: FloatArray, Q: FloatArray, whitened_H: FloatArray, starts: FloatArray, longest: float
+) -> list[FloatArray]:
+    """Return the series of cells with their reach, (TERMS, width + 1) each, for gaps of at most
+    ``longest`` seconds around their middles, with ``starts`` (4, C, n, n) as of transitions_at.
     """
+    observed = len(whitened_H) > 0
+    for terms in (CELL_TERMS + 2, TERMS):
+        series = pack_series(transition_series(A, Q, whitened_H, starts, terms), observed)
+        cells = [with_reach(cell, longest) for cell in series]
+        # Two terms that nothing needs show that those left out are not needed either.
+        if all(cell[-3, -1] == cell[:-1, -1].max() for cell in cells):
+            break
+    rest = np.zeros((TERMS - terms, series.shape[2] + 1))
+    for k, cell in enumerate(cells):
+        rest[:, -1] = cell[-1, -1] = cell[:-1, -1].max()
+        cells[k] = np.concatenate([cell, rest])
+        cells[k][-1, -1] = np.inf
+    return cells
+
+
+def pack_series(parts: FloatArray, observed: bool) -> FloatArray:
+    """Return the series (C, terms, width) of a FlowTable for C cells from those of exp(A g), F,
+    Q_g and G_g in ``parts`` (4, C, terms, n, n): one row for each term, without F and G_g unless
+    something is ``observed``.
+    """
+    E, F, Q_g, G = parts
     rows, columns = np.tril_indices(E.shape[2])
-    parts = [Q_g[:, :, rows, columns], E.reshape(*E.shape[:2], -1)]
+    packed = [Q_g[:, :, rows, columns], E.reshape(*E.shape[:2], -1)]
     if observed:
-        parts += [F.reshape(*F.shape[:2], -1), G[:, :, rows, columns]]
+        packed += [F.reshape(*F.shape[:2], -1), G[:, :, rows, columns]]
     # Zeros up to a multiple of the lanes, see series.fill_row.
-    padding = -sum(part.shape[2] for part in parts) % LANES
-    parts.append(wide_zeros(*parts[0].shape[:2], padding))
-    return np.concatenate(parts, axis=2).astype(np.float64)
+    padding = -sum(part.shape[2] for part in packed) % LANES
+    packed.append(wide_zeros(*packed[0].shape[:2], padding))
+    return np.concatenate(packed, axis=2).astype(np.float64)
 
 
 def whiten_observation(H: FloatArray, R: FloatArray) -> FloatArray:
@@ -227,23 +248,25 @@ def whiten_observation(H: FloatArray, R: FloatArray) -> FloatArray:
 
 
 def transition_series(
-    A: FloatArray, Q: FloatArray, whitened_H: FloatArray, middles: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return Taylor coefficients (C, TERMS, n, n) of exp(A g), the transition F, the noise Q_g and
-    the information G_g of the readings over gaps around ``middles`` (C,), seconds, in extended
-    precision, for C cells, A and Q (n, n) and ``whitened_H`` (q, n).
+    A: FloatArray, Q: FloatArray, whitened_H: FloatArray, starts: FloatArray, terms: int = TERMS
+) -> FloatArray:
+    """Return Taylor coefficients (4, C, terms, n, n) of exp(A g), the transition F, the noise Q_g
+    and the information G_g of the readings over gaps around the middles of C cells, in extended
+    precision, for A and Q (n, n) and ``whitened_H`` (q, n). ``starts`` (4, C, n, n) are their
+    values at the middles.
 
     ``dF = (A - Q_g G) F``, ``dQ_g = A Q_g + Q_g A' + Q - Q_g G Q_g`` and ``dG_g = F' G F``, with
     the information rate ``G = whitened_H' whitened_H``.
     """
-    n, count = len(A), len(middles)
+    n, count = len(A), starts.shape[1]
     A, Q, whitened_H = A.astype(WIDE), Q.astype(WIDE), whitened_H.astype(WIDE)
-    E, F, Q_g, G, Q_g_G = (wide_zeros(count, TERMS, n, n) for _ in range(5))
-    rows = wide_zeros(count, TERMS, len(whitened_H), n)
-    E[:, 0], F[:, 0], Q_g[:, 0], G[:, 0] = transitions_at(A, Q, whitened_H, middles)
+    series, Q_g_G = wide_zeros(4, count, terms, n, n), wide_zeros(count, terms, n, n)
+    rows = wide_zeros(count, terms, len(whitened_H), n)
+    series[:, :, 0] = starts
+    E, F, Q_g, G = series
     # Power-series recursion: the coefficient k + 1 follows from coefficient k of the right-hand
     # side, and products of series are Cauchy products.
-    for k in range(TERMS - 1):
+    for k in range(terms - 1):
         Q_g_G[:, k] = (Q_g[:, k] @ whitened_H.T) @ whitened_H
         rows[:, k] = whitened_H @ F[:, k]
         A_Q_g = A @ Q_g[:, k]
@@ -254,7 +277,7 @@ def transition_series(
         # dG/dg = F' G F = rows' rows, with rows = R^-1/2 H F.
         G[:, k + 1] = _convolved(np.swapaxes(rows, 2, 3), rows, k) / (k + 1)
         E[:, k + 1] = A @ E[:, k] / (k + 1)
-    return E, F, Q_g, G
+    return np.asarray(series)
 
 
 def _convolved(a: FloatArray, b: FloatArray, k: int) -> FloatArray:
@@ -264,17 +287,18 @@ def _convolved(a: FloatArray, b: FloatArray, k: int) -> FloatArray:
 
 def transitions_at(
     A: FloatArray, Q: FloatArray, whitened_H: FloatArray, middles: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+) -> FloatArray:
     """Return exp(A g), the transition F, the noise Q_g and the information G_g of the readings
-    (C, n, n) at the ``middles`` (C,) g = 0 and 3/2, 5/2, ... units of C cells, in seconds, from the
-    exponential exp(M g) of the Hamiltonian M of A and Q (n, n) and ``whitened_H`` (q, n).
+    (4, C, n, n) at the ``middles`` (C,) g = 0 and 3/2, 5/2, ... units of C cells, in seconds, from
+    the exponential exp(M g) of the Hamiltonian M of A and Q (n, n) and ``whitened_H`` (q, n).
     """
     n, count = len(A), len(middles)
-    E, F, Q_g, G = wide_zeros(4, count, n, n)
+    A, Q, whitened_H = A.astype(WIDE), Q.astype(WIDE), whitened_H.astype(WIDE)
+    E, F, Q_g, G = starts = wide_zeros(4, count, n, n)
     E[0] = F[0] = np.eye(n)
     # A single cell is expanded at 0, whose values are already there.
     if count == 1:
-        return E, F, Q_g, G
+        return np.asarray(starts)
     M, scale = hamiltonian(A, Q, whitened_H.T @ whitened_H)
     # exp over half a unit, which is a third of the first middle (3/2 units): all middles are odd
     # multiples of it.
@@ -287,7 +311,8 @@ def transitions_at(
         E[k] = half_unit_A @ half_unit_A @ (E[k - 1] if k > 1 else half_unit_A)
         F[k], G[k], Q_g[k] = flow_triple(E_M)
     # M belongs to P / scale.
-    return E, F, symmetric(Q_g) * scale, symmetric(G) / scale
+    starts[2:] = symmetric(Q_g) * scale, symmetric(G) / scale
+    return np.asarray(starts)
 
 
 def wide_zeros(*shape: int) -> Any:
