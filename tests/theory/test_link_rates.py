@@ -188,5 +188,12 @@ def test_netkf_theory_prints_the_rate(ring):
     delta = 0.1 * np.linalg.norm(theory.limit_covariance(ring))
     assert found["link_rate"]["value"] == pytest.approx(theory.link_rate_for(ring, delta).rate)
     assert "keep the steady bound within 10% of S" in promises_text(ring, found)
-    alone = compute_promises(netkf.load(SCENARIOS / "delayed_links.toml"))["link_rate"]
-    assert alone["reason"] or alone["value"]
+    # With a delay the distance from S grows with the rate in the end.
+    late = ring.replace({"network.channel.delay": {"kind": "constant", "seconds": 0.05}})
+    S = theory.limit_covariance(late)
+    slow, fast = (
+        theory.steady_covariance_bound(late.replace({"network.activation.rate": rate})) - S
+        for rate in (20.0, 2000.0)
+    )
+    assert np.linalg.norm(fast) > np.linalg.norm(slow)
+    assert "links that take no time" in compute_promises(late)["link_rate"]["reason"]

@@ -59,13 +59,15 @@ def link_rate_for(scenario: Scenario, delta: float) -> LinkRate:
     Paper H Theorem 3 says that there are some: ``max_i |calP_i - S|_F <= delta`` in the steady
     state of H(12), with all rates multiplied by one factor. The distance falls with the rates, in
     the end in proportion to 1/rate; the factor is found to 1e-10. 0 if the nodes have S at any
-    rate. Raises TheoryError if H(12) or S do not apply or no rate up to 1e12 times the scenario's
-    suffices.
+    rate. Raises TheoryError if H(12) or S do not apply, as with delays, or no rate up to 1e12 times
+    the scenario's suffices.
     """
     delta = as_number("delta", delta)
     if not 0.0 < delta < math.inf:
         raise TheoryError(f"delta must be a positive number, got {delta!r}")
     equations, S = _require_talk(scenario), limit_covariance(scenario)
+    if equations.delay > 0.0:
+        raise TheoryError("S is the limit for links that take no time")
     known: FloatArray | None = None
 
     def excess(log_factor: float) -> float:
