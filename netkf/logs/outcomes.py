@@ -395,14 +395,16 @@ def shared_fate(outcomes: LogOutcomes, lags: int) -> tuple[Share, Test]:
         together += float((pairs**2).sum()) * mean * (1.0 - 3.0 * mean)
         near = group.follows[1:]
         lasting += float(((z[1:].sum(1) * z[:-1].sum(1) - (z[1:] * z[:-1]).sum(1)) * near).sum())
-    S, D, G = (np.concatenate([*part, np.empty(0)]) for part in (sums, sizes, slopes))
-    what, scale = "share of one fate", float(D.sum())
-    if scale <= 0.0 or alone <= 0.0 or len(S) < MIN_PACKETS:
+    what, scale = "share of one fate", float(sum(D.sum() for D in sizes))
+    if scale <= 0.0 or alone <= 0.0 or sum(map(len, sums)) < MIN_PACKETS:
         return Share(np.nan, np.nan, np.nan), Test(what)
-    share = float(S.sum()) / scale
-    error = math.sqrt(long_run_sum(S - share * (D + G), lags)) / scale
+    share = float(sum(S.sum() for S in sums)) / scale
+    # Each group is a series of its own, whatever the order of groups.
+    parts = zip(sums, sizes, slopes, strict=True)
+    error = math.sqrt(sum(long_run_sum(S - share * (D + G), lags) for S, D, G in parts)) / scale
     # Without shared fate; with bursts of each link neighbouring sums are correlated all the same.
-    slack = long_run_sum(S, lags) / max(long_run_sum(S, 0), 1e-300) if lags else 1.0
+    lasts, once = (sum(long_run_sum(S, many) for S in sums) for many in (lags, 0))
+    slack = lasts / max(once, 1e-300) if lags else 1.0
     unit = math.sqrt(alone * max(slack, 1.0)) / scale
     p_value = 2.0 * float(norm.sf(abs(share) / unit))
     found = Test(what, share, p_value, unit, rise=max(together / alone - 1.0, 0.0))

@@ -149,6 +149,15 @@ def test_statistics_are_what_plain_sums_say():
     assert variance == pytest.approx(((x.sum(axis=1) - 3.0 * p) ** 2).sum() / 120.0**2)
 
 
+def test_the_share_of_one_fate_does_not_depend_on_the_order_of_senders():
+    """Sums of the last packets of one sender were multiplied with those of the first of another."""
+    outcomes = drawn(np.random.default_rng(5), T=40, chain=(0.1, 0.3, 0.95, 0.1))
+    turned = LogOutcomes(outcomes.links, outcomes.groups[::-1], outcomes.channels)
+    np.testing.assert_allclose(shared_fate(turned, 8)[0], shared_fate(outcomes, 8)[0], rtol=1e-12)
+    one, other = (shared_fate(each, 8)[1].p for each in (outcomes, turned))
+    assert one == pytest.approx(other, rel=1e-12)
+
+
 def test_the_time_of_a_chain_and_no_windows_without_a_change():
     """Correlations of .6 ** lag add up to (1 + .6) / (1 - .6); noise has no edges."""
     chain = (0.1, 0.3, 1.0, 0.0)
