@@ -126,7 +126,7 @@ class Flow:
 
     A segment is an interval of rows over which the information of one node accumulates: the whole
     run for filters that combine, from one swap to the next for filters that swap, and one instant
-    for the readings that a message carries.
+    for the readings that a message carries; nodes that forget begin a new one with each life.
 
     node, start    : (G,) node and first row of each segment
     origin, target : (M,) segments of the sender and of the receiver of each message
@@ -154,46 +154,20 @@ def find_flow(
     ``used`` (M,) marks the messages of cost 0, those used in the original run, of which the log may
     be a replay (default: in this log); others cost 1, which counts the missing ones of a path.
     """
-    used = messages.outcome == USED if used is None else used
+    used = np.asarray(messages.outcome == USED if used is None else used)
+    analysis, pooled = scenario.node_filter.analysis, scenario.node_filter.timing.pooled
     nodes = np.array(scenario.nodes)
-    analysis = scenario.node_filter.analysis
-    if analysis.swaps:
-        return _swap_flow(nodes, len(log), messages, np.asarray(used))
-    # One segment for each node, the whole run; its index is that of the node.
-    node = nodes
-    start = np.zeros(len(nodes), dtype=np.int64)
-    origin = np.searchsorted(nodes, messages.sender)
-    # Messages that carry the sender's reading and nothing else.
-    phases = messages.phase.tolist()
-    readings = np.array([not analysis.tells_estimates(phase) for phase in phases], dtype=bool)
-    if readings.any():
-        # A message that carries only the reading of its instant comes from a segment of its own,
-        # which receives no messages.
-        node = np.concatenate([nodes, messages.sender])
-        start = np.concatenate([start, np.searchsorted(log["t"], messages.sent, side="left")])
-        origin = np.where(readings, len(nodes) + np.arange(len(messages)), origin)
-    return Flow(
-        messages=messages,
-        rows=len(log),
-        node=node,
-        start=start,
-        origin=origin,
-        target=np.searchsorted(nodes, messages.receiver),
-        cost=1 - used,
-        last={n: k for k, n in enumerate(scenario.nodes)},  # segment k is that of the k-th node
-        pooled=scenario.node_filter.timing.pooled,
-    )
-
-
-def _swap_flow(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -> Flow:
-    """Return the flow of a filter that swaps: each swap begins a new segment of its node."""
-    swapped = np.flatnonzero(used)
-    node = np.concatenate([nodes, messages.receiver[swapped]])
-    start = np.concatenate([np.zeros(len(nodes), np.int64), messages.used_row[swapped]])
+    # The first rows of segments: of the run, of lives of nodes that forget, and of swaps that took
+    # place. A pooled filter is in no node.
+    wakes = np.flatnonzero(np.isin(log["kind"], list(WAKES)))
+    wakes = wakes[np.isin(log["node"][wakes], [] if pooled else scenario.forgetful_nodes)]
+    swapped = np.flatnonzero(used & analysis.swaps)
+    node = np.concatenate([nodes, log["node"][wakes], messages.receiver[swapped]])
+    start = np.concatenate([np.zeros(len(nodes), np.int64), wakes, messages.used_row[swapped]])
     order = np.lexsort((start, node))
     node, start = node[order], start[order]
     # One sorted key for each segment: its node, then its first row.
-    indices, length = np.searchsorted(nodes, node), rows + 1
+    indices, length = np.searchsorted(nodes, node), len(log) + 1
     keys = indices * length + start
 
     def segment(segment_nodes: IntArray, row: IntArray) -> IntArray:
@@ -201,11 +175,21 @@ def _swap_flow(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -
         return np.asarray(np.searchsorted(keys, sought_keys, side="right") - 1)
 
     origin = segment(messages.sender, messages.sent_row)
-    # A swap that took place begins a segment at its row; others fall into an existing segment.
     target = segment(messages.receiver, np.maximum(messages.used_row, 0))
-    last = segment(nodes, np.full(len(nodes), rows))
+    last = segment(nodes, np.full(len(nodes), len(log)))
+    # Messages that carry the sender's reading and nothing else.
+    phases = messages.phase.tolist()
+    readings = np.array([not analysis.tells_estimates(phase) for phase in phases], dtype=bool)
+    if readings.any():
+        # A message that carries only the reading of its instant comes from a segment of its own,
+        # which receives no messages. Nodes do not use those of before they began again.
+        messages = messages.copy()
+        messages.used_row[readings & (messages.sent_row < start[target])] = NEVER
+        origin = np.where(readings, len(node) + np.arange(len(messages)), origin)
+        node = np.concatenate([node, messages.sender])
+        start = np.concatenate([start, np.searchsorted(log["t"], messages.sent, side="left")])
     ends = dict(zip(nodes.tolist(), last.tolist(), strict=True))
-    return Flow(messages, rows, node, start, origin, target, cost=1 - used, last=ends)
+    return Flow(messages, len(log), node, start, origin, target, 1 - used, ends, pooled)
 
 
 @dataclass(frozen=True, eq=False)

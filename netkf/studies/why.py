@@ -277,7 +277,8 @@ class _Evidence:
         used, unused = direct[is_used], direct[~is_used]
         if not len(used):
             return None, len(unused)
-        last = int(used[np.argmax(messages.used_row[used])])
+        # Of those that were used at one instant the newest.
+        last = int(used[np.lexsort((messages.sent[used], messages.used_row[used]))[-1]])
         return last, int((messages.sent[unused] > messages.sent[last]).sum())
 
 

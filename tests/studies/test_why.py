@@ -626,6 +626,58 @@ def test_what_a_node_heard_before_it_went_down_is_not_used_after(build, tmp_path
     assert sent.tolist() == [1.0]
 
 
+@pytest.mark.parametrize(
+    ("kind", "delay", "heard"),
+    [
+        ("intermittent", 0.0, None),
+        # What was read before the node began again comes after it: a reading is not used then.
+        ("intermittent", 0.7, None),
+        ("diffusion", 0.7, 1.0),
+        ("gossip", 0.7, 1.0),
+    ],
+)
+def test_a_node_that_forgets_knows_no_reading_of_before(build, tmp_path, kind, delay, heard):
+    (tmp_path / "lives.csv").write_text("t,node,what\n1.1,0,down\n1.4,0,up\n")
+    lives = [{"kind": "recorded", "nodes": [0], "path": "lives.csv", "memory": "lost"}]
+    every = {"kind": "periodic", "period": 1.0}
+    activation = {"gossip": every, "diffusion": {**every, "at": "nodes"}}
+    scenario = build(
+        plant={"kind": "diffusion", "A": [[0.1]], "B": [[1.0]], "cov": [[4.0]]},
+        sensors=[{"nodes": [0, 1], "H": [[1.0]], "R": [[0.3]], "sampling": every}],
+        network={
+            "graph": {"kind": "path", "nodes": 2},
+            "activation": activation.get(kind, {"kind": "readings"}),
+            "channel": {"delay": {"kind": "constant", "seconds": delay}},
+            "lives": lives,
+        },
+        filter={"kind": kind}, probe=0.5,
+    )  # fmt: skip
+    for engine in ("simpy", "compiled"):
+        run = netkf.simulate(scenario, engine=engine)
+        found = {s.node: s.reading for s in netkf.why(run, 0, 1.8).sources}
+        assert {node: None if math.isnan(t) else t for node, t in found.items()} == {
+            0: None,
+            1: heard,
+        }
+
+
+def test_of_two_messages_at_one_instant_the_newer_was_heard_last(build, tmp_path):
+    (tmp_path / "delays.csv").write_text("sender,receiver,message,seconds\n1,0,0,1.0\n1,0,1,0.5\n")
+    every = {"kind": "periodic", "period": 0.5}
+    scenario = build(
+        plant={"kind": "diffusion", "A": [[0.1]], "B": [[1.0]], "cov": [[4.0]]},
+        sensors=[{"nodes": [1], "H": [[1.0]], "R": [[0.3]], "sampling": every}],
+        network={
+            "graph": {"kind": "edges", "edges": [[1, 0]], "directed": True},
+            "activation": {"kind": "readings"},
+            "channel": {"delay": {"kind": "recorded", "path": "delays.csv", "after": "lose"}},
+        },
+        filter={"kind": "intermittent"}, probe=0.5,
+    )  # fmt: skip
+    (source,) = netkf.why(netkf.simulate(scenario), 0, 1.8).sources
+    assert (source.heard, source.arrived, source.unheard) == (1.0, 1.5, 1)
+
+
 def test_sentences_tell_of_each_source_what_its_row_says():
     """Node 1 asked about: itself, two neighbours with sensors, and node 4 two links away."""
     nan, lost = math.nan, Missing(4, 2, 7, "lost", 5.0, math.nan)
