@@ -158,7 +158,8 @@ def has_turn(record: Any, h: int, w: int, run: Any) -> bool:
 @kernel
 def emit(record: Any, h: int, m: int, run: Any) -> None:
     """Send the estimate with the factors of the receiver's tie; nothing if no pair has its turn."""
-    first, talks = run.first[h], False
+    # A node without neighbours transmits, as with any filter.
+    first, talks = run.first[h], run.first[h] == run.first[h + 1]
     if run.receiver != ALL:
         write_message(record, h, m, run, run.receiver)
         return

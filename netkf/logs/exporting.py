@@ -120,8 +120,9 @@ def _lives(scenario: Scenario, run: Run, network: dict[str, Any]) -> Files:
         rows += [(c.time, node, words[c.kind]) for node, life in own.items() for c in life.changes]
         if own:
             name = f"lives_{memory}.csv"
-            lines = (f"{stamp(t)},{i},{w}\n" for t, i, w in sorted(rows))
-            files[name] = "t,node,what\n" + "".join(lines)
+            # pandas quotes names with commas.
+            lines = [(stamp(t), str(i), w) for t, i, w in sorted(rows)]
+            files[name] = pd.DataFrame(lines, columns=["t", "node", "what"]).to_csv(index=False)
             entries.append({"kind": "recorded", "nodes": list(own), "path": name, "memory": memory})
     network["lives"] = entries
     return files
@@ -139,7 +140,7 @@ def _positions(scenario: Scenario, run: Run) -> Files:
         sampled = all_sample_times(scenario.sample_times(streams))
         times: list[Any] = [[0.0], tick_times(scenario, streams), sampled, scenario.times]
         looks = [(t, t) for t in np.unique(np.concatenate(times)).tolist()]
-    lines = ["t,node,x,y"]
+    lines = []
     for t, when in looks:
         x = truth.absolute(when)
         for node in scenario.nodes:
@@ -149,8 +150,9 @@ def _positions(scenario: Scenario, run: Run) -> Files:
                 raise ScenarioError("position", rule, len(point), "export --to log")
             if point:
                 place = [repr(float(z)) for z in (*point, 0.0)[:2]]
-                lines.append(f"{scenario.time.stamps.text(t)},{node},{','.join(place)}")
-    return {"positions.csv": "\n".join(lines) + "\n"}
+                lines.append((scenario.time.stamps.text(t), str(node), *place))
+    table = pd.DataFrame(lines, columns=["t", "node", "x", "y"])
+    return {"positions.csv": table.to_csv(index=False)}
 
 
 def export_log(run: Run, out: str | Path) -> tuple[Path, ...]:

@@ -27,7 +27,7 @@ from netkf.algorithms.models import (
 )
 from netkf.algorithms.modes import rate_groups
 from netkf.algorithms.traits import Weights
-from netkf.core.errors import TheoryError
+from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import probability
 from netkf.core.places import Place
 from netkf.linalg.arrays import FloatArray, block_diagonal, is_definite, symmetric
@@ -92,7 +92,19 @@ class DerivedScenario(ScenarioModel):
     @cached_property
     def last_piece(self) -> Self:
         """The scenario with the plant after all its changes, and what filters believe then."""
-        return self.piece(len(self.plant.changes)) if len(self.plant.changes) else self
+        number, cov = len(self.plant.changes), self.filter.cov
+        if not number:
+            return self
+        try:
+            return self.piece(number)
+        except ScenarioError:
+            # Filters that invert P need a definite one at the start of every piece: the noise of
+            # those before has driven every state by then.
+            starts = (
+                cov if isinstance(cov, tuple) else (self.plant.start_cov if cov is None else cov,)
+            )
+            wide = tuple(P + np.eye(len(P)) for P in starts)
+            return self.piece(number, wide if isinstance(cov, tuple) else wide[0])
 
     def piece(self, number: int, cov: tuple[FloatArray, ...] | FloatArray | None = None) -> Self:
         """Return this scenario with a plant that is always as in one piece, and what filters

@@ -279,7 +279,9 @@ def _changes(scenario: Scenario, target: Target, searched: str) -> list[tuple[fl
         before = quantity_by_theory(scenario, target)[0]
     except NetkfError:
         return []
-    found = []
+    found: list[tuple[float, str, str]] = []
+    if not before:
+        return found  # nothing falls below 0, which has no ratios
     for key, changes, shown in _candidates(scenario):
         if key == searched:
             continue

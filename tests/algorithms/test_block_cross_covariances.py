@@ -12,6 +12,7 @@ import scipy.linalg
 
 import netkf
 from netkf.algorithms.filter import Exchange, Message, Reading
+from netkf.scenario.reading import from_table
 from netkf.trace.schema import CODES
 from tests.algorithms.test_block_intersection import CLOCKED, KEPT, ROBOTS, TWO, load
 
@@ -107,6 +108,20 @@ def test_two_nodes_know_their_covariance_whatever_is_lost(tmp_path: Path) -> Non
             np.testing.assert_allclose(run.xhat[k + 1, node], x[entries], atol=1e-10)
             np.testing.assert_allclose(run.P[k + 1, node], E[entries, entries], rtol=1e-9)
     assert alone > 8
+
+
+def test_a_node_without_neighbours_transmits_in_both_engines(tmp_path: Path) -> None:
+    sampling = {"kind": "periodic", "period": 0.5}
+    plant = {"name": "pose", "nodes": [0], "A": [[-0.1]], "B": [[1.0]], "cov": [[1.0]]}
+    sensor = {"of": "pose", "nodes": [0], "H": [[1.0]], "R": [[0.1]], "sampling": sampling}
+    graph = {"kind": "edges", "edges": [], "nodes": [0]}
+    table = {
+        **{"format": 1, "name": "alone", "horizon": 3.0, "probe": 1.0},
+        **{"plants": [plant], "sensors": [sensor], "filter": KEPT | {"estimates": "own"}},
+        "network": {"graph": graph, "activation": {"kind": "readings"}},
+    }
+    runs = [netkf.simulate(from_table(table, tmp_path), engine=e) for e in ("simpy", "compiled")]
+    assert [run.count("transmit") for run in runs] == [5, 5]
 
 
 def test_pairs_take_turns_and_third_nodes_are_approximated(tmp_path: Path) -> None:

@@ -278,6 +278,15 @@ def test_networks_without_links_have_no_row_about_them(tmp_path):
     assert not any("paired" in row.promise for row in found.rows)
 
 
+def test_a_known_plant_without_noise_is_checked(tmp_path):
+    zero = {"kind": "diffusion", "A": [[-0.4]], "B": [[0.0]], "cov": [[0.0]]}
+    sensors = [{"nodes": [0], "H": [[1.0]], "R": [[0.2]]}]
+    table = {**RING, "plant": zero, "sensors": sensors, "filter": {"kind": "local"}}
+    scenario = scenario_of(table, tmp_path)
+    assert check(scenario, runs=10, workers=1)
+    assert netkf.size(scenario, "sensors.0.R.0.0", 0.1, 1.0, "worst_rms<=0.5")
+
+
 def test_a_central_filter_that_is_too_sure_is_caught(tmp_path):
     filtering = {"kind": "tests.checks.broken:TooSureOfAll"}
     broken = broken_promises(scenario_of(GOSSIP, tmp_path, filter=filtering), 20)

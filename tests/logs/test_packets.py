@@ -13,6 +13,7 @@ import netkf
 from netkf.cli.main import main
 from netkf.core.errors import ScenarioError
 from netkf.logs.packets import choose_origin, find_lead, unwrap
+from netkf.scenario.reading import from_table
 from netkf.scenario.writing import as_table, to_toml
 from tests.conftest import SCENARIOS
 
@@ -536,6 +537,28 @@ CAUSES = {
     },
     "clocks": {"clocks": [{"nodes": [0], "offset": 0.05, "drift": -1e-3}]},
 }
+
+
+def test_names_with_commas_and_quotes_stand_in_the_tables_of_a_twin(tmp_path):
+    names = ["a,b", 'c"d']
+    life = {"kind": "crashes", "nodes": names, "mean_up": 1.0, "mean_down": 0.5}
+    network = {
+        "graph": {"kind": "edges", "edges": [names]},
+        "activation": {"kind": "periodic", "period": 0.5, "at": "nodes"},
+        "channel": {"loss": {"kind": "distance", "delivery": [[0.0, 1.0], [9.0, 0.1]]}},
+        "lives": [life],
+    }
+    pose = {"name": "pose", "nodes": names, "position": [0], "cov": [[1.0]]}
+    sampling = {"kind": "periodic", "period": 0.5}
+    table = {
+        **{"format": 1, "name": "names", "horizon": 4.0, "probe": 1.0, "network": network},
+        "plants": [pose | {"A": [[-0.1]], "B": [[1.0]]}],
+        "sensors": [{"nodes": names[:1], "H": [[1.0]], "R": [[0.1]], "sampling": sampling}],
+        "filter": {"kind": "block-intersection", "estimates": "own"},
+    }
+    run = netkf.simulate(from_table(table, tmp_path))
+    path = netkf.export_recorded(run, tmp_path / "twin")[-1]
+    assert netkf.first_difference(run, netkf.simulate(netkf.load(path))) is None
 
 
 @pytest.mark.parametrize("cause", CAUSES)

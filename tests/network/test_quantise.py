@@ -398,6 +398,17 @@ def test_nodes_that_estimate_different_blocks_quantise_alike_in_both_engines():
     np.testing.assert_allclose(fine.P, exact.P, atol=1e-9)
 
 
+def test_beside_an_input_messages_of_a_part_are_those_of_all_blocks():
+    """Nodes of the partition filter keep the whole state, of which they estimate a part."""
+    areas = netkf.load(SCENARIOS / "blocks" / "ieee14_areas.toml").replace({"horizon": 6.0})
+    pushed = {"kind": "constant", "G": [[1.0]] * 3, "value": [0.01]}
+    driven = areas.replace({"plants.0.input": pushed})
+    fine = netkf.simulate(driven.replace({"network.quantise": {"bits": 48, "range": 100.0}}))
+    exact = netkf.simulate(driven)
+    np.testing.assert_allclose(fine.xhat, exact.xhat, atol=1e-9)
+    np.testing.assert_allclose(fine.P, exact.P, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("changes", "key"),
     [

@@ -224,6 +224,24 @@ def test_changes_are_where_slots_begin_and_where_sensors_read():
     assert steps == pytest.approx(round(steps), abs=1e-9)
 
 
+def test_the_last_piece_may_have_noise_that_drives_less(tmp_path):
+    """Its filter inverts P, which is singular at time 0, and no longer when that piece begins."""
+    schedule = [{"from": 1.0, "A": (-0.5 * np.eye(2)).tolist(), "B": [[1.0], [0.0]]}]
+    plant = {"kind": "diffusion", "A": A[0].tolist(), "B": B[0].tolist(), "schedule": schedule}
+    sampling = {"kind": "periodic", "period": 0.5}
+    sensors = [{"nodes": [0], "H": [[1.0, 0.0]], "R": [[0.1]], "sampling": sampling}]
+    activation = {"kind": "poisson", "at": "nodes", "rate": 2.0}
+    network = {"graph": {"kind": "path", "nodes": 2}, "activation": activation}
+    filtering = {"kind": "track-fusion", "rule": "ci"}
+    table = {"format": 1, "name": "less", "horizon": 3.0, "probe": 1.0, "plant": plant}
+    table |= {"sensors": sensors, "network": network, "filter": filtering}
+    less = from_table(table, tmp_path)
+    assert (tmp_path / "run" / "summary.json") in netkf.save(
+        netkf.simulate(less), less, tmp_path / "run"
+    ).iterdir()
+    assert len(netkf.theory.assumptions(less))
+
+
 def test_a_schedule_survives_its_file(tmp_path):
     s = scenario(
         "[{ from = 2.3, A = [[-0.5, -2.0], [2.0, 0.1]] }, { from = 4.1, B = [[0.6], [0.0]] }]"

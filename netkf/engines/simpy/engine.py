@@ -144,7 +144,7 @@ class _Simulation:
 
         def origin_at(sender: int, when: float) -> FloatArray:
             states = believed.states(np.array([when]))[0]
-            return np.asarray(states[scenario.view(scenario.topology.index[sender])])
+            return np.asarray(states[scenario.model_view(scenario.topology.index[sender])])
 
         self._transmitter.origin_at = origin_at
         self._transmitter.estimates_at = lambda sender: nodes[sender].estimates_at
