@@ -141,6 +141,15 @@ def _remaining_eigenvalues(A: FloatArray, border: Border) -> list[complex]:
     return remaining
 
 
+def balanced_norm(A: FloatArray) -> float:
+    """Return the largest 1-norm of the balanced diagonal blocks of A (n, n): with at most n more
+    terms than a number of this size, the power series of exp(A) is as accurate in each entry.
+    """
+    return max(
+        (float(np.abs(one).sum(axis=0).max()) for one in _irreducible_blocks(A)), default=0.0
+    )
+
+
 def _irreducible_blocks(A: FloatArray) -> list[FloatArray]:
     """Return the balanced diagonal blocks of A (n, n) in block triangular form."""
     n = len(A)

@@ -20,7 +20,7 @@ import numpy as np
 
 from netkf.core.fields import field, matrix, of_time, positive, square
 from netkf.linalg.arrays import FloatArray
-from netkf.linalg.spectra import eigenvalues
+from netkf.linalg.spectra import balanced_norm, eigenvalues
 from netkf.plants.changes import DiffusionChange, matrices_of_pieces, schedule_of
 from netkf.plants.laws import GridLaws
 from netkf.plants.paths import DiffusionPath, DiffusionPaths
@@ -80,7 +80,7 @@ class Diffusion(Plant):
     @property
     def longest_period(self) -> float:
         """The longest sensing period (seconds) for which the path is exact to rounding."""
-        norm = max(float(np.abs(piece.A).sum(axis=0).max()) for piece in self.pieces)
+        norm = max(balanced_norm(piece.A) for piece in self.pieces)
         return MAX_STEP / norm if norm > 0.0 else math.inf
 
     @cached_property

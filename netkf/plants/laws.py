@@ -25,6 +25,7 @@ from netkf.linalg.portable import (
 )
 from netkf.linalg.series import exponential_terms, polynomial, with_reach
 from netkf.linalg.small import matmul
+from netkf.linalg.spectra import balanced_norm
 from netkf.plants.transitions import noise_factors
 
 MAX_LAWS = 256  # cached laws of states inside a step
@@ -165,7 +166,7 @@ def fill_impulses(
 
 def _response_series(A: FloatArray, longest: float) -> tuple[FloatArray, FloatArray]:
     """Return power series in the gap of ``exp(A g)`` and of its two moments over the gap."""
-    n, terms = len(A), exponential_terms(float(np.abs(A).sum(axis=0).max()) * longest)
+    n, terms = len(A), exponential_terms(balanced_norm(A) * longest) + len(A)
     exponential = [np.eye(n)]
     for k in range(1, terms):
         exponential.append(product(exponential[-1], A) / k)

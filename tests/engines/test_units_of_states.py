@@ -20,7 +20,7 @@ KEYS = {
 }
 
 
-def scenario(tmp_path, name, units):
+def scenario(tmp_path, name, units, increments=None):
     n, slotted = len(units), name in SLOTS
     kind = name.split()[0]
     D, inverse = np.diag(units), np.diag(1.0 / units)
@@ -30,7 +30,7 @@ def scenario(tmp_path, name, units):
     else:
         plant = {"kind": "diffusion", "A": (D @ (F - np.eye(n)) @ inverse).tolist()}
         plant["B"] = (D @ np.linalg.cholesky(Q)).tolist()
-    plant["cov"] = (D @ D).tolist()
+    plant["cov"] = cov = (D @ D).tolist()
     sensors = [
         {"nodes": [node], "H": [(row / units).tolist()], "R": [[0.4]]} for node, row in enumerate(H)
     ]
@@ -52,6 +52,15 @@ def scenario(tmp_path, name, units):
         },
         "filter": {"kind": kind, **(KEYS.get(name, {}) if slotted else {})},
     }
+    if increments is not None:
+        A, B = increments
+        # A start of no spread: roots of covariances in other units are those of other draws.
+        start = {"cov": np.zeros((n, n)).tolist()}
+        plant |= {"A": (D @ A @ inverse).tolist(), "B": (D @ B).tolist(), **start}
+        clock["at"] = "links"
+        for sensor in sensors:
+            del sensor["sampling"]
+        table["filter"] |= {"cov": cov} | ({"epsilon": 0.3} if kind == "hybrid" else {})
     return from_table(table, tmp_path)
 
 
@@ -63,6 +72,33 @@ def test_P_is_that_of_other_units(tmp_path, name):
     deviations = np.sqrt(np.einsum("tnii->tni", run.P))
     gap = other.P / (UNITS[:, None] * UNITS) - run.P
     assert np.abs(gap / (deviations[..., None] * deviations[..., None, :])).max() < 1e-6
+
+
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+@pytest.mark.parametrize("kind", ["hybrid", "local"])
+@pytest.mark.parametrize(
+    ("A", "B"),
+    [
+        (F - np.eye(3), np.linalg.cholesky(Q)),
+        (np.diag([1.0, 1.0], 1), np.array([[0.0], [0.0], [1.0]])),  # integrators have no norm
+    ],
+)
+def test_increments_are_used_alike_in_other_units(tmp_path, kind, A, B, engine):
+    """Lengths of steps went by the largest entries: a run in millimetres took a thousand times
+    longer than one in metres, or for ever.
+    """
+
+    scenarios = [scenario(tmp_path, kind, units, (A, B)) for units in (np.ones(3), UNITS)]
+    period, other_period = (one.diffusion.sensing_period for one in scenarios)
+    one, other = (netkf.simulate(one, seed=2, engine=engine) for one in scenarios)
+    assert period == other_period
+    deviations = np.sqrt(np.einsum("tnii->tni", one.P))
+    gap = other.P / (UNITS[:, None] * UNITS) - one.P
+    assert np.abs(gap / (deviations[..., None] * deviations[..., None, :])).max() < 1e-12
+    if len(B.T) < 3:
+        return  # states inside a step that one noise drives: rounding chooses among equal draws
+    np.testing.assert_allclose(other.x / UNITS, one.x, rtol=1e-9, atol=1e-9)
+    assert np.abs((other.xhat / UNITS - one.xhat) / deviations).max() < 1e-9
 
 
 @pytest.mark.parametrize(

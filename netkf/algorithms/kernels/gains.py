@@ -22,7 +22,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.kernels.riccati import exponential_series, hamiltonian
+from netkf.algorithms.kernels.riccati import (
+    change_units,
+    exponential_series,
+    hamiltonian,
+    state_units,
+)
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.lanes import LANES, aligned
 from netkf.linalg.legendre import MOMENTS, backward_coefficients
@@ -85,6 +90,9 @@ def gain_table(
     n, p = len(A), len(H)
     if p == 0:
         return GainTable(n, 0, np.zeros((0, 1)))
+    # In units in which entries are of about the same size, powers of 2, see root_flow.
+    units = state_units(A, Q, H.T @ np.linalg.solve(R, H))
+    A, Q, H = change_units(units, A, Q, H)
     # H' R^-1 (n, p).
     HR = np.linalg.solve(R, H).T
     M, scale = hamiltonian(A, Q, HR @ H)
@@ -113,14 +121,19 @@ def gain_table(
     # One power of g more than the gains have: a moment of dy is an integral over the interval,
     # while a gain is a mean.
     series[1:, 2 * size_U :] = predictor.reshape(terms, -1)
-    return GainTable(n, MOMENTS * p, with_reach(series, longest))
+    table = with_reach(series, longest)
+    of_U = np.repeat(units, MOMENTS * p)
+    table[:, :-1] *= np.concatenate([of_U, 1.0 / of_U, np.tile(1.0 / units, MOMENTS * p)])
+    return GainTable(n, MOMENTS * p, table)
 
 
 def longest_interval(A: FloatArray, Q: FloatArray, G: FloatArray) -> float:
     """Return the longest interval (seconds) whose reading the gains can use, for a plant with A and
     Q (n, n) and a sensor with the information rate ``G = H' R^-1 H`` (n, n).
     """
-    M, _ = hamiltonian(A, Q, G)
+    units = state_units(A, Q, G)
+    A, Q, G = change_units(units, A, Q, G)
+    M, _ = hamiltonian(A, Q, G * units[:, None])
     norm = float(np.abs(M).sum(axis=0).max())
     # No dynamics and no information: every interval is short enough.
     return MAX_INTERVAL / norm if norm > 0.0 else math.inf

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray, symmetric
+from netkf.linalg.spectra import balance, balanced_norm
 
 WIDE = np.longdouble  # extended precision where the machine has it
 WIDE_TERMS = 27  # of an exponential in it, for a norm of at most 1
@@ -72,6 +73,23 @@ def hamiltonian(A: FloatArray, Q: FloatArray, G: FloatArray) -> tuple[FloatArray
     return np.block([[-A.T, G * scale], [Q / scale, A]]), scale
 
 
+def state_units(A: FloatArray, Q: FloatArray, G: FloatArray) -> FloatArray:
+    """Return units (n,) of the components of the state, powers of 2, in which the entries of the
+    Hamiltonian of A, Q and G (n, n) are of about the same size.
+    """
+    n = len(A)
+    scale = balance(hamiltonian(A, Q, G)[0])[1]
+    # Rows of P, and of its inverse above them, take units that are each other's inverse.
+    return np.asarray(2.0 ** np.round(0.5 * np.log2(scale[n:] / scale[:n])))
+
+
+def change_units(
+    units: FloatArray, A: FloatArray, Q: FloatArray, H: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return A and Q (n, n) and H (p, n) for a state in other ``units`` (n,)."""
+    return A * units / units[:, None], Q / (units * units[:, None]), H * units
+
+
 def flow_covariance(A: FloatArray, Q: FloatArray, G: FloatArray, gap: float) -> RiccatiFlow:
     """Return the flow of ``dP = A P + P A' + Q - P G P`` over ``gap`` >= 0 seconds; ``A, Q, G`` are
     (n, n). Entries are nan or infinite where an unstable plant overflows.
@@ -80,7 +98,7 @@ def flow_covariance(A: FloatArray, Q: FloatArray, G: FloatArray, gap: float) -> 
     parts = int(min(max(math.ceil(growth / GROWTH), 1), MAX_PARTS))
     gap = gap / parts
     M, scale = hamiltonian(A, Q, G)
-    norm = float(np.abs(M).sum(axis=0).max())
+    norm = balanced_norm(M)
     # By powers of two, so that halving is exact. Doubling also doubles the relative error: after
     # 2^14 parts a triple in double precision would have lost 1e-12.
     doublings = max(0, math.frexp(norm * gap)[1])

@@ -48,7 +48,14 @@ import numpy as np
 
 from netkf.algorithms.kernels.estimates import rotate
 from netkf.algorithms.kernels.gains import GainTable
-from netkf.algorithms.kernels.riccati import WIDE, flow_triple, hamiltonian, wide_exponential
+from netkf.algorithms.kernels.riccati import (
+    WIDE,
+    change_units,
+    flow_triple,
+    hamiltonian,
+    state_units,
+    wide_exponential,
+)
 from netkf.algorithms.kernels.square_root import triangularise
 from netkf.linalg.arrays import FloatArray, IntArray, symmetric
 from netkf.linalg.compiling import kernel
@@ -146,8 +153,28 @@ def flow_table(
 
     The table is fast for gaps up to ``longest`` seconds; longer ones take several steps.
     """
-    n = len(A)
     whitened_H = whiten_observation(H, R)
+    # In units in which entries are of about the same size: limits and lengths of steps go by the
+    # largest ones. Units are powers of 2, so that nothing is rounded.
+    units = state_units(A, Q, whitened_H.T @ whitened_H)
+    table = _tabulate(*change_units(units, A, Q, whitened_H), longest)
+    ratios, products = units[:, None] / units, units[:, None] * units
+    scales = np.stack([ratios, ratios, products, 1.0 / products])
+    table.series[:] *= pack_series(scales[:, None, None], len(whitened_H) > 0)[0, 0]
+    table.gamma[..., 1:] /= np.tile(units, len(whitened_H))
+    table.levels[:, :, :2] *= ratios
+    table.levels[:, :, 2] /= units
+    table.levels[:, :, 3] *= units[:, None]
+    table.whitened_H[0], table.size[0] = whitened_H, (whitened_H * whitened_H).sum()
+    # The triangle inequality over the terms bounds each entry for every gap up to the unit.
+    powers = table.unit ** np.arange(TERMS)
+    table.bound[:] = ((np.abs(table.gamma[..., 1:]) * powers[:, None]).sum(axis=2) ** 2).sum(axis=2)
+    return table
+
+
+def _tabulate(A: FloatArray, Q: FloatArray, whitened_H: FloatArray, longest: float) -> FlowTable:
+    """Return the table of one model, but for bounds and sizes, in the given units of states."""
+    n = len(A)
     M, scale = hamiltonian(A, Q, whitened_H.T @ whitened_H)
     size = np.abs(A)
     # Q_g = int exp(A s) Q exp(A' s) ds grows by A from both sides.
@@ -168,7 +195,7 @@ def flow_table(
     starts = transitions_at(A, Q, whitened_H, middles)
     first = transition_series(A, Q, whitened_H, starts[:, :1])
     E, F, Q_g = first[:3, 0]
-    blocks, bound = information_blocks(whitened_H, F, unit)
+    blocks = information_blocks(whitened_H, F)
     # The reach comes first: a table that is padded to a common width still has it there.
     gamma = [np.roll(with_reach(block.astype(np.float64), unit), 1, axis=1) for block in blocks]
     levels = double_levels(E, F, Q_g, blocks, scale, unit, count)
@@ -188,11 +215,11 @@ def flow_table(
     return FlowTable(
         unit=np.array([unit]),
         sizes=np.array([sizes], dtype=np.int64),
-        size=np.array([float((whitened_H * whitened_H).sum())]),
+        size=np.zeros(1),
         reach=reach[None, :, : last_term + 1, None].copy(),
         series=series[None, :, : last_term + 1].copy(),
         gamma=np.array(gamma).reshape(1, len(gamma), TERMS, len(whitened_H) * n + 1),
-        bound=bound[None],
+        bound=np.zeros((1, len(blocks))),
         levels=levels[None],
         whitened_H=whitened_H[None].copy(),
     )
@@ -322,16 +349,12 @@ def wide_zeros(*shape: int) -> Any:
     return np.zeros(shape, dtype=WIDE)
 
 
-def information_blocks(
-    whitened_H: FloatArray, F: FloatArray, unit: float
-) -> tuple[list[FloatArray], FloatArray]:
-    """Return the power series (TERMS, q n) of ``c_j / (g^j sqrt(2 j + 1))``, one block for each j,
-    and bounds (blocks,) of their squared norms for gaps up to ``unit`` seconds. ``F`` (TERMS, n, n)
-    is the series around 0, and ``whitened_H`` (q, n) is R^-1/2 H.
+def information_blocks(whitened_H: FloatArray, F: FloatArray) -> list[FloatArray]:
+    """Return the power series (TERMS, q n) of ``c_j / (g^j sqrt(2 j + 1))``, one block for each j.
+    ``F`` (TERMS, n, n) is the series around 0, and ``whitened_H`` (q, n) is R^-1/2 H.
     """
     q, n = whitened_H.shape
     blocks: list[FloatArray] = []
-    bounds: list[float] = []
     rows = whitened_H.astype(WIDE) @ F  # (TERMS, q, n)
     # No sensor: no block, and nothing is observed.
     for j in range(min(BLOCKS, TERMS) if q else 0):
@@ -339,11 +362,8 @@ def information_blocks(
         # Moments of u^k with P_j vanish for k < j, so block j starts at g^j, which is factored out.
         for k in range(j, TERMS):
             block[k - j] = legendre_moment(k, j) * math.sqrt(2 * j + 1) * rows[k].ravel()
-        # The triangle inequality over the terms bounds each entry for every gap up to the unit.
-        sizes = (np.abs(block) * WIDE(unit) ** np.arange(TERMS)[:, None]).sum(axis=0)
         blocks.append(block)
-        bounds.append(float((sizes**2).sum()))
-    return blocks, np.array(bounds)
+    return blocks
 
 
 def legendre_moment(k: int, j: int) -> float:
