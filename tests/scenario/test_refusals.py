@@ -233,7 +233,7 @@ PLANT = [
     ("step-text", {"plant.sensing_period": '"a"'}, "plant.sensing_period", "above 0; got 'a'"),
     (
         "step-long",
-        {"plant.sensing_period": "1.0", "sensors.R": "[[0.01]]"},
+        {"plant.sensing_period": "1.0", "sensors.R": "[[0.001]]"},
         "plant.sensing_period",
         "too long for the readings of the most precise node; got 1.0",
     ),
