@@ -556,14 +556,16 @@ class StochasticTrigger(Filter):
             sensors = [scenario.sensors[one.entry] for one in placed]
             rows = sum(len(sensor.R) for sensor in sensors)
             recorded = [isinstance(getattr(one, "path", None), SourceFile) for one in sensors]
-            # One sensor lacks all of its rows or none: only with several may some be missing.
-            if len(sensors) > 1 and any(recorded):
+            present = [one.record.present for one in sensors if one.record is not None]
+            partial = any(bool((p.any(axis=1) & ~p.all(axis=1)).any()) for p in present)
+            # Of several sensors one may have no reading, of one some values may be missing.
+            if (len(sensors) > 1 and any(recorded)) or partial:
                 raise ScenarioError(
                     "filter.Y",
                     f"must be a number, because some rows of the readings of node {node} may be "
                     "missing in a record",
                     "a matrix",
-                    "write a number, or use one sensor",
+                    "write a number",
                 )
             if rows not in (0, len(self.Y)):
                 raise ScenarioError(

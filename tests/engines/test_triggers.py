@@ -9,6 +9,7 @@ import netkf
 from netkf.algorithms.kalman_consensus import Kcf
 from netkf.algorithms.stochastic_trigger import StochasticTrigger
 from netkf.engines.compiled.engine import CompiledEngine
+from netkf.scenario.reading import from_table
 from netkf.trace.schema import CODES
 from tests.algorithms.test_literature import GRAPH, scenario_of
 from tests.conftest import with_slow
@@ -271,3 +272,22 @@ def test_filters_in_plain_python_inside_are_not_compiled(tmp_path):
     assert [run.engine for run in runs] == ["compiled", "compiled", "simpy"]
     with pytest.raises(netkf.EngineError, match="has no code for the filter"):
         netkf.simulate(own, engine="compiled")
+
+
+def test_readings_of_which_values_are_missing(tmp_path):
+    """News are weighed by the rows that are there, which SimPy alone knows."""
+    (tmp_path / "y.csv").write_text("t,node,y0,y1\n0,0,0.5,1.0\n1,0,,0.3\n2,0,0.4,\n3,0,1.0,1.0\n")
+    sensor = {"kind": "recorded", "path": "y.csv", "nodes": [0], "H": [[1.0], [0.5]]}
+    table = {
+        **{"format": 1, "name": "missing", "horizon": 4.0, "probe": 1.0},
+        "plant": {"kind": "linear", "F": [[0.9]], "Q": [[0.1]], "period": 1.0, "cov": [[1.0]]},
+        "sensors": [sensor | {"R": [[0.2, 0.1], [0.1, 0.3]]}],
+        "network": {"graph": {"kind": "path", "nodes": 2}, "activation": {"kind": "broadcast"}},
+        "filter": triggered({"kind": "diffusion"}),
+    }
+    scenario = from_table(table, tmp_path)
+    assert netkf.simulate(scenario).engine == "simpy"
+    with pytest.raises(netkf.EngineError, match="whose rows or R differ"):
+        netkf.simulate(scenario, engine="compiled")
+    with pytest.raises(netkf.ScenarioError, match=r"filter\.Y: must be a number"):
+        scenario.replace({"filter.Y": [[2.0, 0.0], [0.0, 2.0]]})

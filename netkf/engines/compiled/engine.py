@@ -80,6 +80,11 @@ class CompiledEngine(Engine):
             rule = unquantised
         elif (ungated := ungated_readings(scenario)) is not None:
             rule = f"a gate on {ungated}"
+        elif scenario.node_filter.timing.randomised and any(
+            sensor.varying and sensor.record is not None for sensor in scenario.sensors
+        ):
+            # Kernels weigh news by the rows and the R of all readings of a node.
+            rule = "a random trigger on recorded readings whose rows or R differ"
         elif scenario.has_mistimed_increments:
             rule = "sensors that give increments at nodes whose clocks are wrong"
         elif scenario.has_mistimed_models:
