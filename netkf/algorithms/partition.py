@@ -42,6 +42,7 @@ from netkf.algorithms.kernels.run import predict_estimate, shift_vector, transit
 from netkf.algorithms.records import Kernels, Record, estimate_shapes
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.traits import Analysis, Needs
+from netkf.core.errors import ScenarioError
 from netkf.core.places import Key, Place
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
@@ -585,6 +586,24 @@ def begin_partition(_filter: Partition, node: Any, info: NodeInfo, _model: Any) 
     node["Phi"][:] = np.eye(n)
 
 
+def refuse_points_of_pairs(scenario: Any) -> None:
+    """Raise ScenarioError where sigma points would make each row of a reading of several other
+    nodes depend on all of them: how their errors correlate is not known.
+    """
+    method = scenario.filter.linearise
+    if method == "ekf":
+        return
+    for k, node in enumerate(scenario.nodes):
+        for placed in scenario.placed_sensors.get(node, ()):
+            inside = np.isin(scenario.support(placed), scenario.view(k)).all()
+            if inside or scenario.sensors[placed.entry].linear:
+                continue
+            rule = (
+                f'must be "ekf" for the partition filter where node {node} reads blocks of others'
+            )
+            raise ScenarioError("filter.linearise", rule, method, "write that")
+
+
 @built_in("partition")
 @dataclass(frozen=True, eq=False)
 class Partition(Filter):
@@ -599,7 +618,14 @@ class Partition(Filter):
     sender has of other blocks.
     """
 
-    needs = Needs(one_way=True, samples=True, blocks=True, coupled=True, linear_plant=True)
+    needs = Needs(
+        one_way=True,
+        samples=True,
+        blocks=True,
+        coupled=True,
+        linear_plant=True,
+        check=refuse_points_of_pairs,
+    )
     analysis = Analysis(P_by_design=("larger", "larger"), affine=True)
     kernels = Kernels(
         partition_record,

@@ -16,6 +16,7 @@ from netkf.algorithms.registry import built_in_class, overridden
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.model import ALL_READ, RIGHT_CLOCKS
+from netkf.scenario.preconditions import filter_name
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.arrivals import with_last_exchanges
 from netkf.theory.common.block_columns import ClockBlocks, SlotBlocks
@@ -137,15 +138,14 @@ def _errors_of(scenario: Scenario, run: Run) -> ErrorColumns:
     if have_one_view(scenario):
         return _errors_of(scenario_of_view(scenario), run_of_view(scenario, run))
     if scenario.views is not None:
-        name = type(scenario.node_filter).__name__
-        raise TheoryError(f"no exact error covariance for {name} of different blocks")
+        name = filter_name(scenario)
+        raise TheoryError(f"no exact error covariance for the {name} of different blocks")
     if has_columns(scenario):
         return of_kernels(scenario, run)
     require_known_filter(scenario)
     make = theory_of(scenario).error_columns
     if make is None:
-        name = type(scenario.filter.algorithm).__name__
-        raise TheoryError(f"no exact error covariance for {name}")
+        raise TheoryError(f"no exact error covariance for the {filter_name(scenario)}")
     return make(scenario, run)
 
 

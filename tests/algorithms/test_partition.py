@@ -403,3 +403,39 @@ def test_rows_that_read_two_unknown_blocks_are_refused(tmp_path: Path) -> None:
     with pytest.raises(netkf.ScenarioError, match=r"must contain all that drives.*partition"):
         load(AREAS, tmp_path, filter={"kind": "block-intersection", "estimates": "own"})
     assert math.isfinite(netkf.simulate(load(AREAS, tmp_path)).P[-1, 0, 0, 0])
+
+
+def test_readings_of_others_are_not_mixed_by_sigma_points(tmp_path: Path) -> None:
+    """Whitened together, each row would depend on all others, whose errors may correlate: rounding
+    decided what P was.
+    """
+    text = """
+format = 1
+name = "ranges"
+horizon = 2.0
+probe = 1.0
+
+[[plants]]
+name = "place"
+nodes = [0, 1, 2]
+F = [[0.9, 0.0], [0.0, 0.9]]
+Q = [[0.1, 0.0], [0.0, 0.1]]
+cov = [[1.0, 0.0], [0.0, 1.0]]
+period = 1.0
+
+[[sensors]]
+kind = "relative-range"
+of = "place"
+R = [[0.1]]
+
+[network]
+graph = { kind = "complete", nodes = 3 }
+activation = { kind = "broadcast" }
+
+[filter]
+kind = "partition"
+estimates = "own"
+"""
+    load(text, tmp_path)
+    with pytest.raises(netkf.ScenarioError, match=r"filter.linearise: must be \"ekf\".*node 0"):
+        load(text, tmp_path, filter__linearise="ukf")
