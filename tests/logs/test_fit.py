@@ -29,6 +29,7 @@ from netkf.logs.outcomes import (
     shared_fate,
     shared_law,
 )
+from netkf.logs.outcomes import test_identical as identity_test
 from netkf.logs.outcomes import test_time as time_test
 from netkf.scenario.writing import as_table
 from tests.conftest import SCENARIOS
@@ -591,3 +592,20 @@ def _fit_of_delays(folder, delays):
     (folder / "log.csv").write_text(text)
     netkf.import_log(folder / "log.csv", "csv", folder / "made")
     return netkf.fit_log(folder / "made", runs=0)
+
+
+def test_links_that_lose_together_have_fewer_degrees_of_freedom():
+    """Against draws of the normal law: a sum of squares of residuals that correlate."""
+    random, links, share, p = np.random.default_rng(3), 6, 0.5, np.full(6, 0.7)
+    covariance = (1.0 - share) * np.eye(links) + share
+    residuals = random.multivariate_normal(np.zeros(links), covariance, size=4000)
+    spread, packets = np.linalg.eigvalsh(covariance), np.full(links, 500.0)
+    values = [
+        identity_test(
+            np.column_stack([packets, packets * (p + z * np.sqrt(p * (1.0 - p) / packets))]),
+            p, spread, 0,
+        ).p
+        for z in residuals
+    ]  # fmt: skip
+    # Five deviations; with a degree of freedom for each link it is 0.1.
+    assert abs(np.mean(np.array(values) < 0.05) - 0.05) < 0.0175

@@ -12,7 +12,7 @@ import scipy.signal
 import scipy.stats
 
 import netkf
-from netkf.checks.innovations import Innovations
+from netkf.checks.innovations import Innovations, compute_innovations
 from netkf.cli.main import main
 from netkf.scenario.reading import from_table
 from netkf.studies.innovation_tests import (
@@ -410,3 +410,13 @@ def test_a_replay_has_the_sigma_points_of_the_run(tmp_path, kind, linearise):
     # The central filter is no node of the network.
     nodes = [-1] if kind == "central" else [0, 1, 2, 3]
     assert [row.node for row in netkf.innovations(run).rows] == nodes
+
+
+def test_only_readings_that_are_recorded_count():
+    """A slot at the horizon is replayed for its sample, and has no events."""
+    run = netkf.simulate(netkf.load(SCENARIOS / "gossip_ring.toml", {"horizon": 20.0}))
+    sensed = run.events[run.events["kind"] == "sense"]
+    found = compute_innovations(run)
+    assert len(sensed)
+    assert sorted(found.nodes.tolist()) == sorted(sensed["node"].tolist())
+    assert found.times.max() == sensed["t"].max() < 20.0
