@@ -414,7 +414,7 @@ def test_a_replay_has_the_sigma_points_of_the_run(tmp_path, kind, linearise):
 
 def test_only_readings_that_are_recorded_count():
     """A slot at the horizon is replayed for its sample, and has no events."""
-    run = netkf.simulate(netkf.load(SCENARIOS / "gossip_ring.toml", {"horizon": 20.0}))
+    run = netkf.simulate(netkf.load(SCENARIOS / "push_sum_planar.toml", {"horizon": 20.0}))
     sensed = run.events[run.events["kind"] == "sense"]
     found = compute_innovations(run)
     assert len(sensed)
