@@ -26,6 +26,7 @@ from netkf.logs.outcomes import (
     fit_distance,
     long_run_sum,
     make_outcomes,
+    residual_spread,
     shared_fate,
     shared_law,
 )
@@ -188,6 +189,21 @@ def test_departures_of_the_stated_size_are_found_with_the_stated_power():
         for r in seeds(100, 5)
     ]
     assert rate(other) > 0.75
+
+
+def test_the_share_that_many_hearers_find_and_bursts_do_not_feign():
+    """A shared fate makes sums over pairs vary more, and bursts make those of neighbours alike."""
+    plain = {"T": 40, "p": 0.5, "senders": 1, "hearers": 10}
+    found = shared_fate(drawn(np.random.default_rng(0), **plain), 0)[1]
+    share, low = found.detectable(LEVEL), binomial_range(200, 0.9)[0]
+    powers = [
+        rate(shared_fate(drawn(r, share=s, **plain), 0)[1].p < LEVEL for r in seeds(200, 12))
+        for s in (share, found._replace(rise=0.0).detectable(LEVEL))
+    ]
+    assert powers[0] > low > powers[1]
+    tests = [run_tests(drawn(r, chain=(0.03, 0.05, 1.0, 0.0)), None) for r in seeds(60, 13)]
+    assert rate(one["fate"].p < LEVEL for one, *_ in tests) < binomial_range(60, LEVEL)[1]
+    assert rate(abs(s.value) < 1.96 * s.error for _, s, *_ in tests) > binomial_range(60, 0.95)[0]
 
 
 def test_slow_changes_are_found():
@@ -592,6 +608,16 @@ def _fit_of_delays(folder, delays):
     (folder / "log.csv").write_text(text)
     netkf.import_log(folder / "log.csv", "csv", folder / "made")
     return netkf.fit_log(folder / "made", runs=0)
+
+
+def test_residuals_of_hearers_of_one_sender_correlate_by_its_share():
+    outcomes = drawn(np.random.default_rng(4), T=20, senders=2, hearers=4)
+    lone = Group(np.ones((20, 1)), np.arange(20.0), np.arange(20) > 0, np.array([8]))
+    links = (*outcomes.links, ("2", "20"))
+    outcomes = LogOutcomes(links, (*outcomes.groups, lone), ("",) * 3)
+    together = np.array([[0.3 * (a == b) for b, _ in links] for a, _ in links])
+    expected = 2.5 * np.linalg.eigvalsh(together + 0.7 * np.eye(9))
+    np.testing.assert_allclose(np.sort(residual_spread(outcomes, 0.3, 2.5)), expected)
 
 
 def test_links_that_lose_together_have_fewer_degrees_of_freedom():

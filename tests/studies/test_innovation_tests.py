@@ -19,6 +19,7 @@ from netkf.studies.innovation_tests import (
     Stretch,
     _bias,
     _ends_of,
+    _inflation,
     find_stretch,
     format_innovations,
     judge_innovations,
@@ -46,6 +47,8 @@ WALK = {
     "network": {"graph": {"kind": "cycle", "nodes": 4}},
     "filter": {"kind": "local"},
 }
+
+ALWAYS = {"kind": "poisson", "rate": 2.0}
 
 
 def drawn(random, readings=120, nodes=4, rows=1, change=None):
@@ -123,6 +126,25 @@ def test_right_models_are_accused_as_rarely_as_stated(walk, rows):
         not judge_innovations(walk, drawn(random, rows=rows, nodes=2), 0.8) for _ in range(60)
     )
     assert accused <= 20  # at most 20 % are; more in one of 100 tests
+
+
+def test_correlated_innovations_count_as_often_as_they_are_independent(walk):
+    """Of gossip, a chain z <- 0.8 z + noise: sums of it vary (1 + 0.8) / (1 - 0.8) times more."""
+    gossip = walk.replace({"filter": {"kind": "gossip"}, "network.activation": ALWAYS})
+    random, accused, found = np.random.default_rng(5), 0, []
+
+    def chain(node, times, z):
+        z[1:] *= 0.6
+        for k in range(1, len(z)):
+            z[k] += 0.8 * z[k - 1]
+        return z
+
+    for _ in range(60):
+        recorded = drawn(random, readings=400, nodes=2, change=chain)
+        accused += not judge_innovations(gossip, recorded, 0.8)
+        found.append(_inflation([np.concatenate(recorded.whitened)[recorded.nodes == 0]]))
+    assert accused <= 20  # of which 54 are if every innovation counts
+    assert np.median(found) == pytest.approx(9.0, rel=0.15)
 
 
 @pytest.mark.slow
