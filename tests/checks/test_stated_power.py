@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from netkf.checks.exact import _length_interval
+from netkf.checks.exact import _length_interval, detectable_length, gaussian_radius
 from netkf.checks.laws import find
 from netkf.checks.statistics import (
     distance_to_law,
@@ -245,3 +245,12 @@ def test_links_with_few_losses_state_no_error_that_they_could_not_find():
     # Links of which one is up at a time, as in a matching.
     alternate = np.eye(2)[np.arange(len(excess)) % 2]
     assert largest_correlation(excess[:, :2] * alternate, 9.0 * alternate, LEVEL) is None
+
+
+@pytest.mark.parametrize("n", [1, 2, 7])
+def test_lengths_of_gaussian_vectors_have_the_law_of_chi_square(n):
+    """A wider radius would state the error that it finds as well, and find less."""
+    radius = gaussian_radius(LEVEL, n)
+    assert scipy.stats.chi2.sf(radius**2, n) == pytest.approx(LEVEL)
+    found = scipy.stats.ncx2.sf(radius**2, n, detectable_length(radius, n) ** 2)
+    assert found == pytest.approx(POWER)

@@ -210,6 +210,28 @@ def test_exact_scalar_law(delivery):
     assert law.mean() == pytest.approx(means[delivery], rel=1e-6)
 
 
+def test_the_scalar_law_of_any_system_lies_between_all_paths():
+    """From P* and from infinity, by sixteen slots with or without a reading; no number is 1."""
+    F, Q, H, R, g = -1.5, 0.6, -2.0, 0.5, 0.9
+    law = theory.scalar_law(F, Q, H, R, g)
+    low, high, weight = np.array([law.least]), np.array([1e300]), np.ones(1)
+    assert law.least == pytest.approx(F**2 / (1.0 / law.least + H**2 / R) + Q)
+    for _ in range(16):
+        low, high = (
+            np.concatenate([F**2 * P + Q, F**2 / (1.0 / P + H**2 / R) + Q]) for P in (low, high)
+        )
+        weight = np.concatenate([(1.0 - g) * weight, g * weight])
+    x = np.random.default_rng(5).choice(low, 400) * 1.001
+    most, least = (np.array([weight[P <= one].sum() for one in x]) for P in (low, high))
+    assert (least - 1e-12 <= law.cdf(x)).all() and (law.cdf(x) <= most + 1e-12).all()
+    assert (most - least).max() < 1e-2
+    np.testing.assert_allclose(law.cdf_after(x, 16, law.least), most, rtol=0, atol=1e-12)
+    assert law.mean() == pytest.approx(weight @ low, rel=1e-6)
+    order, levels = np.argsort(low), np.array([0.05, 0.3, 0.91, 0.95, 0.992])
+    places = order[np.searchsorted(np.cumsum(weight[order]), levels)]
+    np.testing.assert_allclose(law.quantile(levels), low[places], rtol=1e-6)
+
+
 @pytest.mark.parametrize("level", CASES["scalar_law"])
 def test_quantiles_of_the_scalar_law(level):
     law = theory.scalar_law(*SCALAR, float(level))
