@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import scipy.integrate
+import scipy.linalg
 import scipy.stats
 
 import netkf
@@ -142,6 +143,24 @@ PHASE = {"kind": "periodic", "period": 1.0, "phase": 0.5}
 def test_what_follows_of_no_steady_consistent_filter_is_not_known(scenario_of, changes, known):
     scenario = scenario_of('{ kind = "biased", size = 1.5, since = 5.0 }').replace(changes)
     assert (of(scenario) is not None) is known
+
+
+def test_readings_by_a_clock_are_refused_as_those_of_the_slots_that_it_makes(scenario_of):
+    A, B = np.array([[-0.1, 0.3], [0.0, -0.2]]), np.array([[0.05], [0.1]])
+    # Van Loan: one exponential has both exp(A h) and the noise of h seconds.
+    whole = scipy.linalg.expm(0.5 * np.block([[-A, B @ B.T], [np.zeros((2, 2)), A.T]]))
+    sensor = {"sensors.0.H": [[1.0, 0.5]], "filter.cov": np.eye(2).tolist()}
+    F, Q = whole[2:, 2:].T, whole[2:, 2:].T @ whole[:2, 2:]
+    slots = {"kind": "linear", "F": F.tolist(), "Q": (0.5 * (Q + Q.T)).tolist(), "period": 0.5}
+    clock = {"sensors.0.sampling": {"kind": "periodic", "period": 0.5}}
+    clocked = {"kind": "diffusion", "A": A.tolist(), "B": B.tolist()}
+    made = scenario_of('{ kind = "biased", size = 1.5, since = 5.0 }')
+    by_slots, by_clock = (
+        of(made.replace({**sensor, **more}))
+        for more in ({"plant": slots}, {"plant": clocked, **clock})
+    )
+    assert by_slots.alone[0] > 2.0 * by_slots.alone[-1]
+    np.testing.assert_allclose(by_clock, by_slots, rtol=1e-9)
 
 
 def test_who_knows_the_state_notices_a_drift_before_who_hears_nobody(scenario_of):

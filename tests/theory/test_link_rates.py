@@ -12,6 +12,7 @@ from netkf import theory
 from netkf.core.errors import TheoryError
 from netkf.theory.hybrid import linearised, steady
 from netkf.theory.promises import compute_promises, promises_text
+from netkf.theory.hybrid.second_moments import second_moment_rate
 from tests.cases import FOLDER
 from tests.conftest import SCENARIOS
 
@@ -197,3 +198,17 @@ def test_netkf_theory_prints_the_rate(ring):
     )
     assert np.linalg.norm(fast) > np.linalg.norm(slow)
     assert "links that take no time" in compute_promises(late)["link_rate"]["reason"]
+
+
+@pytest.mark.parametrize("channel", [{}, {"loss": {"kind": "bernoulli", "delivery": 0.7}}])
+def test_second_moments_of_P_grow_as_those_of_a_linear_recursion(build, channel):
+    """Gains of the bound; p <- W p at a tick moves E[p p'] by W (x) W, and both ends at once."""
+    scenario = pair(build, a=0.3).replace({"network.channel": channel})
+    rate = 3.0 * channel.get("loss", {}).get("delivery", 1.0)
+    P = plain_steady(0.3, 0.5 * rate)
+    between, tick = np.diag([2 * (0.3 - 2.0 * P[0]), 2 * 0.3]), np.full((2, 2), 0.5)
+    eye = np.eye(2)
+    moved = np.kron(between, eye) + np.kron(eye, between)
+    moved += rate * (np.kron(tick, tick) - np.eye(4))
+    expected = np.linalg.eigvals(moved).real.max()
+    assert second_moment_rate(scenario) == pytest.approx(expected, rel=1e-8)
