@@ -11,8 +11,8 @@ import netkf
 from netkf import theory
 from netkf.core.errors import TheoryError
 from netkf.theory.hybrid import linearised, steady
-from netkf.theory.promises import compute_promises, promises_text
 from netkf.theory.hybrid.second_moments import second_moment_rate
+from netkf.theory.promises import compute_promises, promises_text
 from tests.cases import FOLDER
 from tests.conftest import SCENARIOS
 
