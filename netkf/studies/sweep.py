@@ -229,11 +229,19 @@ def sweep_to_directory(
     directory = create_output_directory(out, f"{plan.base.name}-sweep")
     write_scenario(directory, plan.base)
     rows: list[Row] = []
-    status = "interrupted"
+    status, is_written = "interrupted", False
     _write_manifest(directory, plan, 0, status)
     try:
         for row in _simulate_points(plan, pool, progress):
             rows.append(row)  # noqa: PERF402 - an interrupted sweep keeps its rows
+        seconds = time.perf_counter() - started
+        completed = CompletedSweep(directory, pd.DataFrame(rows), tuple(plan.vary), seconds)
+        if take is not None:
+            take(completed)
+        _write_rows(directory, rows)
+        is_written = True
+        if finish is not None:
+            finish(completed)
         status = "complete"
     # Whatever happens, the rows so far and the status are written.
     except KeyboardInterrupt:
@@ -242,18 +250,19 @@ def sweep_to_directory(
         status = "failed"
         raise
     finally:
-        seconds = time.perf_counter() - started
-        completed = CompletedSweep(directory, pd.DataFrame(rows), tuple(plan.vary), seconds)
-        if status == "complete" and take is not None:
-            take(completed)
-        if len(completed.table):
-            columns = {str(name): column for name, column in completed.table.items()}
-            write_table(directory / "sweep.parquet", columns)
-            write_text(directory / "sweep.csv", completed.table.to_csv(index=False))
-        if status == "complete" and finish is not None:
-            finish(completed)
+        if rows and not is_written:
+            _write_rows(directory, rows)
         _write_manifest(directory, plan, len(rows), status)
     return completed
+
+
+def _write_rows(directory: Path, rows: Sequence[Row]) -> None:
+    """Write sweep.parquet and sweep.csv."""
+    import pandas as pd
+
+    table = pd.DataFrame(rows)
+    write_table(directory / "sweep.parquet", {str(name): table[name] for name in table})
+    write_text(directory / "sweep.csv", table.to_csv(index=False))
 
 
 def _write_manifest(directory: Path, plan: SweepPlan, points_done: int, status: str) -> None:

@@ -216,15 +216,14 @@ def test_what_was_interrupted_has_what_was_kept(short, tmp_path):
     assert (found.status, 0 < done < 40) == ("interrupted", True)
     whole = netkf.monte_carlo(short, done, workers=1)
     np.testing.assert_allclose(found.mean_P, whole.mean_P, rtol=1e-10)
-    with pytest.raises(KeyboardInterrupt):
-        sweep_to_directory(
-            plan_sweep(short, {"seed": [1, 2]}),
-            tmp_path / "s",
-            PoolOptions(1),
-            progress=interrupt,
-        )
-    found = netkf.open(tmp_path / "s")
-    assert (found.status, len(found.table)) == ("interrupted", 1)
+    points = plan_sweep(short, {"seed": [1, 2]})
+    for done, when in ((1, {"progress": interrupt}), (2, {"finish": interrupt})):
+        with pytest.raises(KeyboardInterrupt, match="what was finished is kept in"):
+            sweep_to_directory(points, tmp_path / str(done), PoolOptions(1), **when)
+        found = netkf.open(tmp_path / str(done))
+        assert (found.status, len(found.table)) == ("interrupted", done)
+        kept = json.loads((tmp_path / str(done) / "manifest.json").read_text())
+        assert kept["runs"] == {"wanted": 2, "done": done}
 
 
 def test_without_tables_there_are_no_samples(short, tmp_path):
