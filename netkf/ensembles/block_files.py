@@ -12,7 +12,6 @@ import hashlib
 import io
 import json
 import os
-import platform
 import shutil
 import threading
 from abc import ABC, abstractmethod
@@ -28,7 +27,7 @@ from netkf.ensembles.merge_tree import Merge, MergeTree
 from netkf.ensembles.pool import MAX_BLOCK
 from netkf.ensembles.replicas import Node
 from netkf.runs.documents import MAX_COUNT, DamagedError, reading_file
-from netkf.runs.files import write_atomically, writing_file
+from netkf.runs.files import this_process, write_atomically, writing_file
 from netkf.runs.provenance import machine, versions
 
 MARK = b"\nsha256 "  # begins the last line of a block's file
@@ -216,8 +215,7 @@ class BlockFiles(ABC):
         np.savez(block, **arrays)
         block.write(MARK + digest_of(block, block.tell()))
         # Another worker may write the same block: the one who renames last wins, with the same.
-        writer = f"{platform.node()}-{os.getpid()}."
-        with write_atomically(self._path(node), writer) as part:
+        with write_atomically(self._path(node), this_process()) as part:
             part.write_bytes(block.getvalue())
         self._nodes.add(node)
         self._own.add(node)

@@ -24,7 +24,7 @@ from matplotlib.textpath import TextToPath
 from netkf.core.printable import one_line, shorten
 from netkf.figures.names import SERIES
 from netkf.linalg.arrays import FloatArray
-from netkf.runs.files import write_atomically
+from netkf.runs.files import this_process, write_atomically
 
 BLUE, VERMILLION, GREEN, PURPLE, INK, ORANGE, SKY, MUTED = (one.colour for one in SERIES)
 FAINT = "#bbbbbb"
@@ -155,7 +155,7 @@ def write_figure(figure: Figure, path: Path) -> None:
     # Without dates, the same figure always has the same bytes.
     undated: dict[str, Any] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
     metadata = undated[file_format]
-    with style_context(), write_atomically(path) as temporary:
+    with style_context(), write_atomically(path, this_process()) as temporary:
         figure.set_dpi(RESOLUTION)
         if (engine := figure.get_layout_engine()) is not None:
             # Once, instead of in a first drawing of all artists that is thrown away.

@@ -13,7 +13,7 @@ from netkf.core.extras import require
 from netkf.core.printable import NamedNode
 from netkf.core.version import __version__
 from netkf.ensembles.monte_carlo import Ensemble
-from netkf.runs.files import output_file, write_atomically
+from netkf.runs.files import output_file, this_process, write_atomically
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.writing import resolve_defaults, to_toml
 from netkf.trace.run import Run
@@ -150,6 +150,6 @@ def export_netcdf(result: Run | Ensemble, out: str | Path) -> tuple[Path, ...]:
     require("h5netcdf", "xarray", "export")
     path = output_file(out, "run.nc" if isinstance(result, Run) else "ensemble.nc")
     dataset = to_xarray(result)
-    with write_atomically(path) as temporary:
+    with write_atomically(path, this_process()) as temporary:
         dataset.to_netcdf(temporary, engine="h5netcdf")
     return (path,)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from netkf.network.graphs import Link
-from netkf.runs.files import output_file, require_trace, write_atomically
+from netkf.runs.files import output_file, require_trace, this_process, write_atomically
 from netkf.trace.messages import DELIVERED, LATE, LOST, by_link, join_messages
 from netkf.trace.run import Run
 
@@ -29,7 +29,7 @@ def export_graphml(run: Run, out: str | Path) -> tuple[Path, ...]:
 
     graph = carried_network(run)
     path = output_file(out, "network.graphml")
-    with write_atomically(path) as temporary:
+    with write_atomically(path, this_process()) as temporary:
         networkx.write_graphml(graph, temporary)
     return (path,)
 

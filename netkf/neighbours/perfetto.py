@@ -16,7 +16,7 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import number
-from netkf.runs.files import output_file, require_trace, write_atomically
+from netkf.runs.files import output_file, require_trace, this_process, write_atomically
 from netkf.trace.messages import LOST, join_messages
 from netkf.trace.nees import traces
 from netkf.trace.run import Run
@@ -61,7 +61,10 @@ def export_perfetto(
         _counters(run, pids, begin, end),
     )
     about = {"scenario": run.scenario.name, "seed": run.seed, "replica": run.replica}
-    with write_atomically(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+    with (
+        write_atomically(path, this_process()) as temporary,
+        temporary.open("w", encoding="utf-8") as file,
+    ):
         file.write(f'{{"displayTimeUnit": "ms", "otherData": {json.dumps(about)},\n')
         file.write('"traceEvents": [\n')
         file.write(",\n".join(json.dumps(event, allow_nan=False) for event in events))

@@ -12,7 +12,7 @@ from netkf.core.fields import as_path
 from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
 from netkf.ensembles.monte_carlo import Ensemble
 from netkf.report.page import make_page
-from netkf.runs.files import write_text
+from netkf.runs.files import this_process, write_text
 from netkf.runs.run import save
 from netkf.scenario.plugins import user_components
 from netkf.trace.run import Run
@@ -34,7 +34,7 @@ class Page:
     def save(self, path: str | Path) -> Path:
         """Write the page to ``path``, in place of a file there, and return it; raises WriteError"""
         path = as_path("path", path)
-        write_text(path, self.html)
+        write_text(path, self.html, this_process())
         return path
 
 

@@ -29,7 +29,7 @@ from netkf.report.markup import Packer, bullets, content_hash, paragraph, script
 from netkf.report.mending import describe_central, describe_mending, explain_worst, mending_section
 from netkf.report.outcome_figure import filters_figure, outcome_figures
 from netkf.runs.documents import FINAL_STATUSES, DamagedError
-from netkf.runs.files import require_own, write_text
+from netkf.runs.files import require_own, this_process, write_text
 from netkf.scenario.writing import toml_text
 from netkf.studies.compare import Comparison, compare, damage_named
 from netkf.studies.explanation import Why
@@ -90,7 +90,7 @@ def write_report(
     path = Path(directories[0]) / "report.html" if out is None else out
     if out is not None or path.parent.is_dir():
         _require_page(path)
-    write_text(path, make_page(directories, replica, (trust, trust), path))
+    write_text(path, make_page(directories, replica, (trust, trust), path), this_process())
     return path
 
 

@@ -8,6 +8,7 @@ import hashlib
 import json
 import math
 import os
+import platform
 import shutil
 import stat
 from collections.abc import Collection, Iterable, Iterator
@@ -75,6 +76,13 @@ def publish(temporary: Path, path: Path) -> None:
             os.close(directory)
 
 
+def this_process() -> str:
+    """Return a ``writer`` of ``write_atomically`` for files that several commands may write at once
+    because none has locked their directory: the last one wins.
+    """
+    return f"{platform.node()}-{os.getpid()}."
+
+
 @contextlib.contextmanager
 def write_atomically(path: Path, writer: str = "") -> Iterator[Path]:
     """Yield a temporary path that replaces ``path`` after the body, or is removed if that raises; a
@@ -93,9 +101,9 @@ def write_atomically(path: Path, writer: str = "") -> Iterator[Path]:
         raise
 
 
-def write_text(path: Path, text: str) -> None:
+def write_text(path: Path, text: str, writer: str = "") -> None:
     """Write a text file atomically, in UTF-8; raises WriteError."""
-    with write_atomically(path) as temporary:
+    with write_atomically(path, writer) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 

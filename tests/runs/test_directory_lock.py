@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import networkx
 import pytest
 
 import netkf
@@ -96,3 +97,22 @@ def test_a_file_system_without_locks_is_noted(tmp_path, monkeypatch, capsys):
     with lock_directory(tmp_path):
         pass
     assert "one command at a time" in capsys.readouterr().err
+
+
+def test_two_processes_that_hold_no_lock_write_one_file_whole(tmp_path, monkeypatch):
+    run = netkf.simulate(netkf.load(RING, {"horizon": 1.0}))
+    out, write = tmp_path / "out.graphml", networkx.write_graphml
+
+    def overtaken(graph, path):
+        Path(path).write_text("half")
+        monkeypatch.setattr(networkx, "write_graphml", write)
+        monkeypatch.setattr(os, "getpid", lambda: -1)
+        netkf.export_graphml(run, tmp_path)
+        (tmp_path / "network.graphml").rename(out)
+        assert Path(path).read_text() == "half"
+        write(graph, path)
+
+    monkeypatch.setattr(networkx, "write_graphml", overtaken)
+    netkf.export_graphml(run, tmp_path)
+    assert (tmp_path / "network.graphml").read_bytes() == out.read_bytes()
+    assert len(list(tmp_path.iterdir())) == 2
