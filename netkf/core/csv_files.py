@@ -13,6 +13,7 @@ import gzip
 import io
 import itertools
 import math
+import re
 import zlib
 from array import array
 from collections.abc import Collection, Iterator, Mapping
@@ -33,6 +34,10 @@ STAMPS = ("t", "from", "until")
 """The columns that hold times, in every table."""
 NODES = ("node", "peer", "sender", "receiver", "to")
 """The columns that hold nodes, by id or by name, in every table."""
+_ADDRESS = re.compile(r"[0-9]+[eE][0-9]+")
+"""Hexadecimal addresses of motes that look like numbers, such as 12e4; large numbers that programs
+write have a sign or a point, as 1e+05 has.
+"""
 _FOREIGN = {
     b"PK": "it is a zip file or a spreadsheet; save the table as CSV",
     b"\xff\xfe": "it is UTF-16 text; save it as UTF-8",
@@ -232,7 +237,7 @@ class _Entries:
             return source.node_ids[name]
         if not name and not may_miss:
             raise self._refusal(column, "must be the id or the name of a node", "correct the entry")
-        if not name or is_number_text(name):
+        if not name or (is_number_text(name) and not _ADDRESS.fullmatch(name)):
             number = self.number(column, may_miss)
             if number < 0.0:
                 raise self._refusal(column, "must be an integer from 0 to 2^53", "correct it")

@@ -594,7 +594,8 @@ def node_id(low: int | None = None, high: int | None = None) -> Rule:
             # Ids of nodes with names are integers of a class of their own.
             return value if isinstance(value, int) else node
         if not value.strip() or len(value) > MAX_NAME or not value.isprintable():
-            raise ValueError
+            rule = f"must be an id, or a name of at most {MAX_NAME} printable characters"
+            raise _SpecificError(rule, "correct the name")
         return value.strip()
 
     schema = {"anyOf": [dict(ids.schema), {"type": "string", "minLength": 1}]}

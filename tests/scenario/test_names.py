@@ -103,6 +103,18 @@ def test_names_in_all_tables_and_fields_are_the_run_with_ids(named, tmp_path):
     assert sampled.sensors[0].sampling.recorded_times(1).tolist() == [1.2, 3.0]
 
 
+def test_addresses_that_look_like_numbers_are_names_and_messages_say_what_a_name_is(folder):
+    for name, text in TABLES.items():
+        (folder / name).write_text(text.replace("lab", "12e4"))
+    table = json.loads(json.dumps(SCENARIO).replace("lab", "12e4"))
+    assert dict(from_table(table, folder).topology.names) == {"12e4": 0, "roof": 1, "cellar": 2}
+    for name in ("", "a\nb", "x" * 300):
+        table["sensors"][0]["nodes"][0] = name
+        rule = r"must be an id, or a name of at most \d+ printable characters"
+        with pytest.raises(netkf.ScenarioError, match=rule):
+            from_table(table, folder)
+
+
 def test_names_in_a_table_of_regressors_and_of_ranges(named, folder):
     (folder / "phi.csv").write_text("t,node,y0,phi0\n1,lab,2,0.5\n2,roof,1,0.25\n")
     (folder / "far.csv").write_text("t,node,to,y0\n1,lab,roof,2\n2,roof,cellar,1\n")
