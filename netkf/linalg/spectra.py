@@ -29,6 +29,8 @@ ROUNDING = 32.0 * float(np.finfo(float).eps)
 times its norm."""
 BORDER = 1e-9
 """A spectral radius that is closer to 1 is 1, as large matrices have it to that only."""
+LARGEST_POWER = 1000
+"""Largest power of 2, up or down, by which balancing multiplies a component of the state."""
 HIDDEN = 1e-9
 """A mode is hidden if it changes no output by more than this share of its size."""
 MAX_CLUSTERED, MAX_TESTED, MAX_MULTIPLE = 32, 8, 8
@@ -91,18 +93,22 @@ def hidden_mode(A: FloatArray, C: FloatArray, border: Border | None = None) -> c
 
     Neither units of states that A couples nor those of all outputs together matter.
     """
-    n = len(A)
     balanced, scale = balance(A)
-    outputs = C * scale
-    size = float(np.linalg.norm(balanced, 2)) or 1.0
-    largest = float(np.abs(outputs).max(initial=0.0)) or 1.0
     values = eigenvalues(A).tolist() if border is None else _remaining_eigenvalues(A, border)
     for value in values:
-        # The mode is hidden if A - value I and C have a common null vector.
-        pencil = np.concatenate([balanced - value * np.eye(n), outputs * (size / largest)])
-        if np.linalg.svd(pencil, compute_uv=False)[-1] < HIDDEN * size:
+        # In the given units too: where A is nearly triangular, as [[1e-12, 1], [0, 1]] is, balanced
+        # ones make the entries vanish that couple its blocks.
+        if _hides(balanced, C * scale, value) and _hides(A, C, value):
             return value if value.imag else value.real + 0.0  # -0.0 is 0
     return None
+
+
+def _hides(A: FloatArray, C: FloatArray, value: complex) -> bool:
+    """Return True if A - value I and C have a common null vector, but for HIDDEN."""
+    size = float(np.linalg.norm(A, 2)) or 1.0
+    largest = float(np.abs(C).max(initial=0.0)) or 1.0
+    pencil = np.concatenate([A - value * np.eye(len(A)), C * (size / largest)])
+    return bool(np.linalg.svd(pencil, compute_uv=False)[-1] < HIDDEN * size)
 
 
 def outputs_of(information: FloatArray) -> FloatArray:
@@ -210,8 +216,11 @@ def balance(A: FloatArray) -> tuple[FloatArray, FloatArray]:
             row = math.hypot(*balanced[i].tolist())
             if not (0.0 < column < math.inf and 0.0 < row < math.inf):
                 continue
-            # The power of 2 that brings both norms closest to each other.
-            factor = 2.0 ** min(max(round(0.5 * (math.log2(row) - math.log2(column))), -500), 500)
+            # The power of 2 that brings both norms closest to each other, but for a scale beyond
+            # the range of numbers, to which one small entry on the diagonal can lead.
+            power = min(max(round(0.5 * (math.log2(row) - math.log2(column))), -500), 500)
+            done = math.log2(scale[i])
+            factor = 2.0 ** min(max(power, -LARGEST_POWER - done), LARGEST_POWER - done)
             if column * factor + row / factor < 0.95 * (column + row):
                 changed = True
                 scale[i] *= factor

@@ -129,14 +129,17 @@ GROWTH = 10.0 * math.log(2.0)
 """Logarithm of the factor by which an unstable state may grow within a frame, 2^10. A frame is an
 interval after which states are taken relative to a new origin, so that errors keep their digits.
 """
+LONGEST_FRAME = 1e18
+"""Seconds; horizons have at most 1e15 ticks of at most a second."""
 
 
 def frame_period(A: FloatArray) -> float | None:
     """Return the length of a frame in seconds, 1, 2 or 5 times a power of ten, in which states of
-    ``dx = A x dt``, ``A`` (n, n) in 1/s, grow at most 2^10-fold; None if they do not grow.
+    ``dx = A x dt``, ``A`` (n, n) in 1/s, grow at most 2^10-fold; None if they do not grow, or so
+    slowly that no run is as long as a frame.
     """
     rate = growth_rate(A)
-    return decimal_below(GROWTH / rate) if rate > 0.0 else None
+    return decimal_below(GROWTH / rate) if rate > GROWTH / LONGEST_FRAME else None
 
 
 def decimal_below(bound: float) -> float:

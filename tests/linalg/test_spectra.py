@@ -89,6 +89,17 @@ def test_undamped_modes_count_as_those_that_do_not_decay():
         assert hidden_mode(0.999 * Q, np.zeros((1, 3)), FACTOR) is None
 
 
+@pytest.mark.parametrize("small", [5e-324, 1e-300, 1e-22, 1e-12, 1e-6, 0.0])
+def test_a_fast_state_that_follows_a_slow_one_shows_it(small):
+    # A sensor with a lag, sampled slowly: F has exp(-T / lag) beside 1 - exp(-T / lag).
+    F, show, hide = np.array([[small, 1.0], [0.0, 1.0]]), np.eye(2)[:1], np.array([[1.0, -1.0]])
+    for units in (np.ones(2), np.array([1.0, 1024.0])):
+        scaled = F * units / units[:, None]
+        assert hidden_mode(scaled, show * units, FACTOR) is None
+        assert small == 1e-6 or hidden_mode(scaled, hide * units, FACTOR) == 1.0
+        assert np.isfinite(balance(scaled)[1]).all()
+
+
 def test_sensors_of_very_different_precision_show_modes_alike():
     A = np.zeros((2, 2))
     assert hidden_mode(A, outputs_of(np.diag([1e6, 1e-7]))) is None

@@ -79,9 +79,10 @@ def state_units(A: FloatArray, Q: FloatArray, G: FloatArray) -> FloatArray:
     """
     n = len(A)
     scale = balance(hamiltonian(A, Q, G)[0])[1]
-    # Rows of P, and of its inverse above them, take units that are each other's inverse. Couplings
-    # as weak as 1e-300 would take units whose products are beyond the range of numbers.
-    return np.asarray(2.0 ** np.clip(np.round(0.5 * np.log2(scale[n:] / scale[:n])), -240, 240))
+    # Rows of P, and of its inverse above them, take units that are each other's inverse. Products
+    # of two stay in the range of numbers.
+    powers = 0.5 * (np.log2(scale[n:]) - np.log2(scale[:n]))
+    return np.asarray(2.0 ** np.clip(np.round(powers), -240, 240))
 
 
 def change_units(
