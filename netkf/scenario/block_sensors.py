@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -193,23 +193,40 @@ def _for_block(sensor: Any, place: Place, nodes: tuple[int, ...], layout: Layout
 def _pairs(sensor: Any, layout: Layout, topology: Topology) -> Iterator[tuple[Place, Place]]:
     """Yield the blocks of the pairs that a relative sensor reads, that of the reader first."""
     name = sensor.of
+    owned = dict.fromkeys(place.name for place in layout.places if place.node is not None)
+    listed = ", ".join(f'"{one}"' for one in owned)
     if name is None:
-        owned = dict.fromkeys(place.name for place in layout.places if place.node is not None)
         if len(owned) != 1:
-            listed = ", ".join(f'"{one}"' for one in owned)
             remedy = f"write of = ..., one of {listed}" if owned else "give [[plants]] nodes"
             raise ScenarioError("of", "is missing, the block that is read", None, remedy)
         name = next(iter(owned))
+    if name not in owned:
+        remedy = f"{suggest_nearest(name, owned)}names are {listed}" if owned else "give it nodes"
+        raise ScenarioError("of", "must be the name of [[plants]] with nodes", name, remedy)
     owners = {p.node: p for p in layout.places if p.name == name and p.node is not None}
+    nodes = sensor.nodes or () if sensor.record is None else ()
+    if len(set(nodes)) < len(nodes):
+        remedy = "write a second [[sensors]] entry for a second sensor"
+        raise ScenarioError("nodes", "must name each node once", list(nodes), remedy)
+    for k, node in enumerate(nodes):
+        _require_owner(f"nodes[{k}]", "", node, name, owners)
+    seen = set()
     for key, where, reader, other in _targets(sensor, topology, list(owners)):
         for node in (reader, other):
-            if node not in owners:
-                rule = f"{where}must be nodes with a block {name!r} of their own"
-                remedy = f"nodes with it are {', '.join(map(str, owners))}"
-                raise ScenarioError(key, rule, node, remedy)
+            _require_owner(key, where, node, name, owners)
         if reader == other:
             raise ScenarioError(key, f"{where}must be two nodes", reader, "correct the pair")
+        if (reader, other) in seen:
+            raise ScenarioError(key, "must be another pair", [reader, other], "list it once")
+        seen.add((reader, other))
         yield owners[reader], owners[other]
+
+
+def _require_owner(key: str, where: str, node: int, name: str, owners: Mapping[int, Place]) -> None:
+    if node not in owners:
+        rule = f"{where}must be nodes with a block {name!r} of their own"
+        remedy = f"nodes with it are {', '.join(map(str, owners))}"
+        raise ScenarioError(key, rule, node, remedy)
 
 
 def _targets(
