@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import as_path
+from netkf.core.fields import as_path, number
 from netkf.logs.mercator import read_mercator
 from netkf.logs.mrclam import read_mrclam
 from netkf.logs.packet_tables import read_tables
@@ -54,6 +54,7 @@ def import_log(
         if value not in known:
             rule = f"must be one of {', '.join(known)}"
             raise ScenarioError(key, rule, value, "choose one of them")
+    hole = number(above=0.0)("hole", hole)
     if columns and kind != "csv":
         raise ScenarioError("columns", "are those of kind csv", kind, "leave them out")
     if kind == "mrclam" and (like, unreported, hole) != (None, "unknown", HOLE):

@@ -18,7 +18,7 @@ import pandas as pd
 
 from netkf.core.csv_files import is_number_text, open_table
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import SourceFile
+from netkf.core.fields import MAX_MAGNITUDE, SourceFile
 from netkf.core.printable import count_phrase
 from netkf.core.stamps import UNITS, TimeBase
 from netkf.linalg.arrays import FloatArray
@@ -160,6 +160,9 @@ def parse_stamps(
         except ValueError:
             rule = f"line {line}: {name} must be a number or an ISO 8601 time"
             raise ScenarioError(str(path), rule, text, "correct the entry") from None
+        if abs(stamps[-1]) > MAX_MAGNITUDE:
+            rule = f"line {line}: {name} must be at most {MAX_MAGNITUDE:g} s in size"
+            raise ScenarioError(str(path), rule, text, "correct the entry")
         kinds.setdefault((":" in text, bool(_ZONE.search(text))), line)
     if len(kinds) > 1 and notes is not None:
         where = " and ".join(map(str, [*kinds.values()][:2]))

@@ -12,7 +12,7 @@ import pandas as pd
 
 from netkf.core.csv_files import is_number_text
 from netkf.core.errors import ScenarioError
-from netkf.core.printable import count_phrase
+from netkf.core.printable import MAX_NAME, count_phrase
 from netkf.core.stamps import TimeBase
 from netkf.logs.packets import PacketLog, accounts, note_count, settle
 from netkf.network.clocks import LinkClock, OnReadings
@@ -87,7 +87,7 @@ def write_network(
     rename_nodes(log, {str(node) for node in like.nodes} if like else set())
     if like is not None:
         _begin_with(like, log)
-    outcomes = settle(log, hole, unreported)
+    outcomes = log.outcomes if log.outcomes.empty else settle(log, hole, unreported)
     if outcomes.empty:
         rule = "must have packets that somebody heard: a sender and one receiver a row"
         raise ScenarioError(name, rule, None, "name its column: --columns receiver=COLUMN")
@@ -155,7 +155,7 @@ def rename_nodes(log: PacketLog, known: set[str]) -> None:
         names = {node: str(int(node)) for node in nodes}  # as tables write 01
     else:
         names = {n: f"n{name}" if is_number_text(name) else name for n, name in names.items()}
-    if len(set(names.values())) < len(nodes):
+    if len(set(names.values())) < len(nodes) or max(map(len, names.values())) > MAX_NAME:
         names = {node: f"n{k}" for k, node in enumerate(nodes)}
     # A row that begins with # is a comment; of other names tables hold all.
     kept = {name for name in known if not name.startswith("#")}

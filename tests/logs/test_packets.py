@@ -1,6 +1,7 @@
 """Packet logs: what they say is in the tables, and nothing else; a run comes back to the bit."""
 
 import gzip
+import math
 import os
 from decimal import Decimal
 
@@ -168,6 +169,8 @@ def test_outcomes_events_and_repeated_rows(tmp_path, capsys):
         (["t,src,dst,seq", "1,1,2,x"], r"line 2: seq must be a number"),
         (["t,src,dst,seq", f"1,1,2,{2**60}"], r"line 2: number must be an integer from 0 to 2\^53"),
         (["t,src,1,2", "1,1,1,0"], r"must have packets that somebody heard"),
+        (["t,src,seq,ok", "1,1,0,1"], r"must have packets that somebody heard"),
+        (["t,src,dst", "1,1,2", "1e300,1,2"], r"line 3: t must be at most 1e\+30 s in size"),
         (["t,src,dst,ok", "1,1,2,maybe"], r"line 2: ok must say 1 or 0"),
         (["t,dst", "1,2"], r"must have a column sender"),
         (["t,src,dst", "1,2,2"], r"line 2: sender and receiver must differ"),
@@ -183,6 +186,19 @@ def test_a_bad_log_is_refused_with_its_line(tmp_path, rows, message):
     with pytest.raises(ScenarioError, match=message):
         netkf.import_log(log, "csv", tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("hole", [math.nan, -1.0, 0.0])
+def test_a_hole_is_a_number_of_packets(tmp_path, hole):
+    log = write(tmp_path / "log.csv", ["t,src,dst", "1,a,b"])
+    with pytest.raises(ScenarioError, match="hole: must be a finite number above 0"):
+        netkf.import_log(log, "csv", tmp_path / "out", hole=hole)
+
+
+def test_names_that_tables_cannot_hold_are_others(tmp_path):
+    log = write(tmp_path / "log.csv", ["t,src,dst", f"1,{'a' * 300},b"])
+    (scenario, *_), _ = netkf.import_log(log, "csv", tmp_path / "out")
+    assert set(netkf.load(scenario).topology.names) == {"n0", "n1"}
 
 
 def test_a_silent_receiver_has_a_hole_if_others_hear(tmp_path):
