@@ -8,7 +8,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -55,6 +55,9 @@ class Life(Component):
             the covariance of its filter, in slots when the next one begins
     """
 
+    _change_rate: ClassVar[float] = 0.0
+    """Changes of a node in a second, in the mean; 0 where it is not known."""
+
     nodes: tuple[int, ...] = field(list_of(node_id(), "node ids"))
     memory: str = field(one_of("kept", "lost"), default="kept")
 
@@ -81,6 +84,10 @@ class Crashes(Life):
     mean_up: float = field(positive)
     mean_down: float = field(positive)
 
+    @property
+    def _change_rate(self) -> float:  # type: ignore[override]
+        return 2.0 / (self.mean_up + self.mean_down)
+
     def changes(
         self, node: int, random: Callable[[], np.random.Generator], horizon: float
     ) -> Sequence[Change]:
@@ -101,6 +108,10 @@ class DutyCycle(Life):
     period: float = field(of_time(positive))
     up: float = field(of_time(positive))
     phase: float = field(of_time(number(low=0.0)), default=0.0)
+
+    @property
+    def _change_rate(self) -> float:  # type: ignore[override]
+        return 2.0 / self.period
 
     def __post_init__(self) -> None:
         """Check the fields; raises ScenarioError if a node would never be down."""

@@ -45,6 +45,7 @@ MAX_SAMPLES = 10_000_000  # state samples of one run
 MAX_ENTRIES = 100_000_000
 """Numbers in all sampled covariances of one run: 0.8 GB of memory."""
 MAX_STEPS = 100_000_000  # steps of one run; more suggest a wrong unit of time
+MAX_CHANGES = 10_000_000  # of nodes that go up and down, which are kept in memory: 1 GB
 MAX_TICKS = 1e9  # ticks of one clock; more suggest a wrong unit of time
 MAX_CONSTANTS = 1e15  # time constants of one run; more have no exact count in floating point
 UNIX = "where it is a Unix time, set [time] origin and count it from there"
@@ -223,6 +224,12 @@ def _check_owners(name: str, entries: Sequence[Any]) -> None:
 def _check_lives(scenario: DerivedScenario) -> None:
     lives = scenario.network.lives
     _check_owners("lives", lives)
+    for k, life in enumerate(lives):
+        changes = life._change_rate * scenario.horizon * len(life.nodes)
+        if changes > MAX_CHANGES:
+            rule = f"must make nodes go up and down at most {MAX_CHANGES:,} times up to the horizon"
+            remedy = "lengthen the times up and down, or shorten the horizon"
+            raise ScenarioError(f"network.lives[{k}]", rule, f"{changes:.3g} times", remedy)
     clocked = compiled_kernels(scenario.node_filter, clocked=True)
     # Whether nodes of the filter can go without the increments of their sensors.
     can_pause = (clocked is None or clocked.is_kalman) and not scenario.node_filter.timing.pooled

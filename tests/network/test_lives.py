@@ -194,6 +194,22 @@ def test_only_nodes_that_go_without_increments_may_be_down(scenario_of):
         scenario_of(CONTINUOUS, *recorded(), filter_="central")
 
 
+@pytest.mark.parametrize("text", [CLOCKS, SLOTS])
+@pytest.mark.parametrize(
+    "keys",
+    [
+        'kind = "crashes"\nmean_up = 1e-9\nmean_down = 1e-9',
+        'kind = "crashes"\nmean_up = 5e-324\nmean_down = 5e-324',
+        'kind = "duty"\nperiod = 1e-9\nup = 5e-10',
+    ],
+)
+def test_more_changes_than_memory_holds_are_refused(scenario_of, text, keys):
+    with pytest.raises(
+        netkf.ScenarioError, match=r"network\.lives\[0\]: must .* at most 10,000,000"
+    ):
+        scenario_of(text, f"[[network.lives]]\nnodes = [1]\n{keys}")
+
+
 @pytest.mark.parametrize("at", ["nodes", "links", "directions"])
 @pytest.mark.parametrize(
     ("text", "memory"), [(CLOCKS, "kept"), (CLOCKS, "lost"), (CONTINUOUS, "kept")]
