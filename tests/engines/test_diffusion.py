@@ -1,10 +1,12 @@
 """The diffusion filter: reference cases, lost messages, regressors, baselines, special cases."""
 
 import json
+import math
 
 import numpy as np
 import pytest
 import scipy.integrate
+import scipy.stats
 
 import netkf
 from netkf import theory
@@ -368,6 +370,30 @@ def test_information_level_of_fixed_rows_is_a_formula(build):
     assert table.level.tolist() == pytest.approx([0.125, 0.0, 0.0], rel=1e-12)
     table = theory.information_level(scenario, window=3)
     assert table[["level", "mean"]].iloc[0].tolist() == pytest.approx([0.1875, 0.1875], rel=1e-12)
+
+
+def test_the_mean_information_level_is_an_integral_over_the_laws_of_regressors(build):
+    """s = 3 in slot 0, then s <- 0.8 s + xi: phi = 2 s is normal j slots after each of three."""
+    sensor = {"kind": "regressor", "nodes": [0], "A": [[0.8]], "B": [[1.0]], "C": [[2.0]]}
+    scenario = build(
+        plant={"kind": "linear", "F": [[1.0]], "Q": [[1.0]], "period": 1.0},
+        sensors=[{**sensor, "R": [[1.0]], "start": [3.0], "xi_cov": [[0.3]]}],
+        horizon=3.0,
+        probe=1.0,
+        network={"graph": {"kind": "path", "nodes": 2}, "activation": {"kind": "broadcast"}},
+        filter={"kind": "diffusion"},
+    )
+
+    def excitation(slot):
+        mean, deviation = 2.0 * 3.0 * 0.8**slot, 2.0 * math.sqrt(0.3 * (1.0 - 0.64**slot) / 0.36)
+        phi = scipy.stats.norm(mean, deviation)
+        return phi.expect(lambda x: x * x / (1.0 + x * x), epsabs=1e-12)
+
+    expected = np.mean([excitation(k + 1) + excitation(k + 2) for k in range(3)]) / 3.0
+    row = theory.information_level(scenario, 4000, 2, window=2).iloc[0]
+    assert row["mean_high"] - row["mean_low"] < 0.02 * expected
+    # Twice the interval of 99 %: five deviations.
+    assert abs(row["mean"] - expected) < row["mean_high"] - row["mean_low"]
 
 
 def test_theory_that_needs_a_fixed_H_says_so():
