@@ -14,6 +14,7 @@ from netkf.cli.main import main
 from netkf.scenario.reading import from_table
 from netkf.scenario.tables import as_table
 from netkf.studies.compare_filters import write_comparison
+from netkf.studies.filter_values import FilterValues, credibility
 from netkf.studies.tables import format_filters
 from tests.conftest import SCENARIOS
 
@@ -273,3 +274,13 @@ def test_one_record_is_no_test_of_P(scenario, tmp_path):
     blind = netkf.compare_filters(from_table(table, tmp_path), ["central"], runs=2, workers=1)
     assert "worst instant: truth unknown, largest root of trace P of any n" in format_filters(blind)
     assert "consistency: -, where all runs have the one state or readings of a record" in text
+
+
+@pytest.mark.parametrize(
+    ("size", "word"), [(0.5, "conservative"), (1.0, "consistent"), (2.0, "overconfident")]
+)
+def test_credibility_is_told_of_squares_of_normal_numbers(size, word):
+    """Of NEES of three states in 25 runs; the truth is called something else in at most 5 %."""
+    nees = size * np.random.default_rng(6).chisquare(3, size=(200, 25))
+    said = [credibility(FilterValues(one, one, one[:, None], one > 0.0), 3.0, 0.05) for one in nees]
+    assert said.count(word) > 178
