@@ -280,7 +280,7 @@ def test_one_record_is_no_test_of_P(scenario, tmp_path):
     ("size", "word"), [(0.5, "conservative"), (1.0, "consistent"), (2.0, "overconfident")]
 )
 def test_credibility_is_told_of_squares_of_normal_numbers(size, word):
-    """Of NEES of three states in 25 runs; the truth is called something else in at most 5 %."""
-    nees = size * np.random.default_rng(6).chisquare(3, size=(200, 25))
+    """Of NEES of three states in 100 runs; the truth is called something else in at most 5 %."""
+    nees = size * np.random.default_rng(6).chisquare(3, size=(200, 100))
     said = [credibility(FilterValues(one, one, one[:, None], one > 0.0), 3.0, 0.05) for one in nees]
     assert said.count(word) > 178
