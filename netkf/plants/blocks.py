@@ -239,6 +239,29 @@ class StackedInput(Input):
         """Return u (K, m) at K ``times`` (K,) in seconds."""
         return np.concatenate([one.values(times) for one in self.inputs], axis=1)
 
+    def known_to(self, model: Any) -> FloatArray:
+        """Return 1 for each component that filters with the ``model`` know, else 0, (m,)."""
+        return np.concatenate([one.known_to(model) for one in self.inputs])
+
+
+@dataclass(frozen=True, eq=False)
+class PieceNumber(Input):
+    """The number of the piece that holds of a linear block whose matrices change at ``times``
+    (seconds), told as an input: what integrates a plant begins anew where its input jumps.
+    """
+
+    times: FloatArray = field(vector)
+
+    @cached_property
+    def exogenous(self) -> Exogenous:
+        """The system whose output is the number, which counts the changes."""
+        times, one = self.time_grid.snap(self.times), np.ones((1, 1))
+        return Exogenous(times, 0.0 * one, one, np.arange(1.0, len(times) + 1.0)[:, None])
+
+    def known_to(self, model: Any) -> FloatArray:
+        """Return 1 if filters with the ``model`` follow changes, else 0, (1,)."""
+        return np.full(1, float(model.schedule))
+
 
 def _copies(blocks: Sequence[Block]) -> list[tuple[int, Any]]:
     """Return the number of the entry of each place of a layout, and its plant."""
@@ -269,6 +292,8 @@ def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
             block.check_means()
             for plant in block.copies:
                 plant.read()
+            if block.plant.linear:
+                _check_gains(block.copies[0])
     plants = _plants(blocks)
     is_random = all(plant.is_random for plant in plants)
     if not all(plant.linear for plant in plants):
@@ -292,17 +317,21 @@ def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
 def _stack_nonlinear(blocks: Sequence[Block], layout: Layout) -> Plant:
     slotted = isinstance(blocks[0].plant, SlotPlant)
     for k, block in enumerate(blocks):
-        _check_beside_nonlinear(k, block)
-    plants, parts = _plants(blocks), []
+        if not block.plant.linear:
+            with errors_under(f"[{k}]"):
+                block.copies[0].check_dynamics()
+    plants, parts, inputs = _plants(blocks), list[BlockPart](), list[Input]()
     for plant in plants:
-        u = plant.input
-        m, name = 0 if u is None else u.m, "F" if slotted else "A"
+        of_plant = [plant.input] if plant.input is not None else []
+        matrices = gains = None
         if plant.linear:
-            G = None if u is None else u.G
-            parts.append(BlockPart(None, plant.n, m, getattr(plant, name), G))
-        else:
-            parts.append(BlockPart(plant.f, plant.n, m))
-    inputs = [plant.input for plant in plants if plant.input is not None]
+            matrices = np.array([getattr(one, "F" if slotted else "A") for one in plant.pieces])
+            gains = np.array(plant.input_gains) if of_plant else None
+            if len(matrices) > 1:
+                of_plant.append(PieceNumber(times=plant.schedule_times))
+        m = sum(one.m for one in of_plant)
+        parts.append(BlockPart(None if plant.linear else plant.f, plant.n, m, matrices, gains))
+        inputs += of_plant
     coupling = np.zeros((layout.n, layout.n))
     _add_couplings(coupling, blocks, layout)
     shared: dict[str, Any] = {
@@ -331,19 +360,6 @@ def _noise_at(plant: Any, name: str, time: float) -> FloatArray:
     k = sum(change.start <= time for change in plant.schedule)
     noise: FloatArray = matrices_of_pieces({name: getattr(plant, name)}, plant.schedule)[k][name]
     return noise
-
-
-def _check_beside_nonlinear(k: int, block: Block) -> None:
-    """Raise ScenarioError if block number ``k`` cannot stand among blocks that are not linear."""
-    plant = block.copies[0]
-    if len(plant.changes):
-        rule = "must be left out where blocks are not linear, whose f says it with x and t"
-        raise ScenarioError(f"[{k}].schedule", rule, None, "write one f for all of it")
-    if plant.linear:
-        _check_gain(k, plant.input, plant.n)
-    else:
-        with errors_under(f"[{k}]"):
-            plant.check_dynamics()
 
 
 def _stacked_matrices(blocks: Sequence[Block], layout: Layout) -> dict[str, Any]:
@@ -398,7 +414,9 @@ def _check_shapes(k: int, block: Block) -> None:
         given += [(f"schedule[{c}].{name}", name, one) for name, one in change.matrices.items()]
     shapes |= {"F": (n, n), "A": (n, n)}
     for key, name, value in given:
-        is_wide = name == "G" or (name == "B" and plant.linear)
+        if name == "G":
+            continue  # as wide as the input, see _check_gains
+        is_wide = name == "B" and plant.linear
         shape = (n, value.shape[-1]) if is_wide else shapes[name]
         if value is not None and value.shape != shape:
             wanted, actual = (" x ".join(map(str, one)) for one in (shape, value.shape))
@@ -419,21 +437,30 @@ def _one(blocks: Sequence[Block], key: str) -> Any:
 def _stacked_input(blocks: Sequence[Block], layout: Layout) -> StackedInput | None:
     """Return what drives all blocks; None if nothing does."""
     inputs, parts = list[Input](), list[FloatArray]()
-    for place, (k, plant) in zip(layout.places, _copies(blocks), strict=True):
+    for place, plant in zip(layout.places, _plants(blocks), strict=True):
         one = plant.input
         if one is None:
             continue
-        _check_gain(k, one, place.n)
         inputs.append(one)
         parts.append(np.zeros((layout.n, one.m)))
         parts[-1][place.entries] = one.G
     return StackedInput(inputs=tuple(inputs), G=np.concatenate(parts, axis=1)) if inputs else None
 
 
-def _check_gain(k: int, u: Input | None, n: int) -> None:
-    if u is not None and (u.G is None or u.G.shape != (n, u.m)):
-        rule = f"must be {n} x {u.m}"
-        raise ScenarioError(f"[{k}].input.G", rule, u.G, "correct the shape")
+def _check_gains(plant: Any) -> None:
+    """Raise ScenarioError unless each G of a linear ``plant`` is that of its input."""
+    given = [
+        (f"schedule[{c}].G", one.G) for c, one in enumerate(plant.schedule) if one.G is not None
+    ]
+    if plant.input is None:
+        for key, G in given:
+            rule = "belongs to a plant with an input"
+            raise ScenarioError(key, rule, G, "add an input to this block, or leave it out")
+        return
+    for key, G in [("input.G", plant.input.G), *given]:
+        if G is None or G.shape != (plant.n, plant.input.m):
+            rule = f"must be {plant.n} x {plant.input.m}"
+            raise ScenarioError(key, rule, G, "correct the shape")
 
 
 def _add_couplings(M: FloatArray, blocks: Sequence[Block], layout: Layout) -> None:

@@ -85,15 +85,15 @@ class CustomDynamics(Component):
 
 
 class BlockPart(NamedTuple):
-    """A block of n states with m inputs: its f, or the matrices F or A (n, n) and G (n, m) of a
-    linear one.
+    """A block of n states with m inputs: its f, or F or A (K, n, n) and G (K, n, m) of a linear
+    one. If K > 1 there is a last input: the number of those that hold.
     """
 
     f: Any
     n: int
     m: int
-    matrix: FloatArray | None = None
-    G: FloatArray | None = None
+    matrices: FloatArray | None = None
+    gains: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,14 +122,22 @@ class StackedDynamics(Component):
 class _Linear:
     """A linear block as if it were a user's."""
 
-    def __init__(self, matrix: FloatArray, G: FloatArray | None) -> None:
-        self._matrix, self._G = matrix, G
+    def __init__(self, matrices: FloatArray, gains: FloatArray | None) -> None:
+        self._matrices, self._gains = matrices, gains
+
+    def _piece(self, u: FloatArray) -> int:
+        last = len(self._matrices) - 1
+        return min(max(int(u[-1]), 0), last) if last else 0
 
     def f(self, x: FloatArray, u: FloatArray, _: float) -> FloatArray:
-        return self._matrix @ x if self._G is None else self._matrix @ x + self._G @ u
+        k = self._piece(u)
+        moved = np.asarray(self._matrices[k] @ x)
+        if self._gains is not None:
+            moved += self._gains[k] @ u[: self._gains.shape[2]]
+        return moved
 
-    def jacobian(self, _x: FloatArray, _u: FloatArray, _t: float) -> FloatArray:
-        return self._matrix
+    def jacobian(self, _x: FloatArray, u: FloatArray, _t: float) -> FloatArray:
+        return np.asarray(self._matrices[self._piece(u)])
 
 
 class _Stacked:
@@ -223,13 +231,13 @@ def functions_of(f: Any, n: int, m: int, in_slots: bool) -> Any:
     kernels can call: in slots the map of one, else the rate of change.
     """
     shapes = [((n,), (m,), out) for out in ((n,), (n, n))]
-    if isinstance(f, StackedDynamics) and len(f.parts) == 1 and f.parts[0].matrix is None:
+    if isinstance(f, StackedDynamics) and len(f.parts) == 1 and f.parts[0].matrices is None:
         return functions_of(f.parts[0].f, n, m, in_slots)
     if isinstance(f, StackedDynamics):
         pairs = [
             functions_of(
-                part.f if part.matrix is None
-                else CustomDynamics("", _Linear(part.matrix, part.G)),
+                part.f if part.matrices is None
+                else CustomDynamics("", _Linear(part.matrices, part.gains)),
                 part.n, part.m, in_slots,
             )
             for part in f.parts

@@ -62,6 +62,10 @@ class Input(Component, OnGrid):
         """Number of components of u."""
         return len(self.exogenous.C)
 
+    def known_to(self, model: Any) -> FloatArray:
+        """Return 1 for each component that filters with the ``model`` know, else 0, (m,)."""
+        return np.full(self.m, float(model.input))
+
     def at(self, time: float) -> FloatArray:
         """Return u (m,) at ``time`` in seconds; where it jumps, the value after it."""
         return np.asarray(self.values(np.array([time]))[0])

@@ -358,7 +358,7 @@ class DerivedScenario(ScenarioModel):
         plant = self.slot_plant
         assert isinstance(plant, NonlinearPlant)
         u = plant.inputs(int(self.horizon / plant.period) + 2)
-        return u if self.filter.model.input else 0.0 * u
+        return u if plant.input is None else u * plant.input.known_to(self.filter.model)
 
     @cached_property
     def node_infos(self) -> tuple[NodeInfo, ...]:
@@ -878,8 +878,10 @@ class DerivedScenario(ScenarioModel):
                 changes = (np.diff(values[:, inputs], axis=0) != 0.0).any(axis=1)
                 jumps = np.append(True, changes)
                 times, values = times[jumps], values[jumps]
-            known = 1.0 if self.filter.model.input else 0.0
-            amplitudes = np.array([[known], [1.0], [1.0]])
+            known = np.zeros(0)
+            if plant.input is not None:
+                known = plant.input.known_to(self.filter.model)[inputs]
+            amplitudes = np.stack([known, np.ones_like(known), np.ones_like(known)])
             return RateModel(
                 A, noises[0], H, R, self.horizon, self.horizon, f=f, jacobian=jacobian,
                 step=plant.step, noises=noises, noise_times=self.believed_noises[0],

@@ -364,15 +364,78 @@ def test_mistakes_in_sensors_of_blocks_are_those_of_the_file(scenario, key, valu
     assert str(caught.value).startswith(f"sensors[0].{words}")
 
 
-def test_changes_of_dynamics_beside_curved_blocks_are_refused_in_one_line(scenario):
-    plants = poses(period=0.5, Q=Q_POSE.tolist())
-    target = {"name": "target", "F": [[1.0]], "Q": [[1.0]], "period": 0.5}
-    target["schedule"] = [{"from": 1.0, "F": [[0.5]]}]
+CHANGES = [
+    {"from": 1.0, "F": [[0.2, 0.3], [-0.5, 0.9]], "G": [[0.0], [2.0]]},
+    {"from": 1.5, "Q": [[1.0, 0.0], [0.0, 2.0]], "G": [[1.0], [0.0]]},
+]
+DRIVE = {"kind": "sine", "amplitude": 1.0, "frequency": 0.3, "phase": 0.4, "G": [[1.0], [0.5]]}
+
+
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+@pytest.mark.parametrize("model", [{}, {"schedule": False}, {"input": False}])
+def test_blocks_change_beside_one_whose_f_is_linear_as_in_the_linear_plant(scenario, model, engine):
+    block = {"name": "area", "Q": [[0.2, 0.1], [0.1, 0.3]], "period": 0.5, "nodes": [1]}
+    changing = {**block, "F": [[0.5, 0.0], [0.0, 0.6]], "input": DRIVE, "schedule": CHANGES}
+    changing |= {"name": "other", "nodes": [2], "cov": np.eye(2).tolist()}
+    sensor, runs = {"H": [[1.0, 0.5]], "R": [[0.2]]}, []
+    for dynamics in ({"kind": "nonlinear", "f": Damped}, {"F": Damped.F.tolist()}):
+        sensors = [
+            {**sensor, "of": name, "nodes": [node]} for name, node in (("area", 1), ("other", 2))
+        ]
+        changes = {
+            "plants": [{**block, **dynamics}, changing],
+            "sensors": sensors,
+            "filter": {"kind": "central", "model": model},
+        }
+        runs.append(netkf.simulate(scenario.replace(changes), seed=3, engine=engine))
+    for name in ("x", "xhat", "P"):
+        np.testing.assert_allclose(*(getattr(run, name) for run in runs), atol=1e-12)
+
+
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+@pytest.mark.parametrize("model", [{}, {"schedule": False}])
+def test_blocks_in_continuous_time_change_beside_curved_ones(scenario, tmp_path, model, engine):
+    """At an instant inside steps and between readings."""
+    rows = [f"{0.3 * k},{node},{math.sin(k + node)}" for k in range(1, 8) for node in (1, 2)]
+    (tmp_path / "seen.csv").write_text("\n".join(["t,node,y0", *rows]) + "\n")
+    drive = {"kind": "constant", "value": [0.7], "G": [[1.0], [0.5]]}
+    changes = [
+        {"from": 0.8137, "A": [[-0.2, 3.0], [-2.0, 0.0]], "G": [[0.0], [2.0]]},
+        {"from": 1.6, "B": [[2.0], [0.5]], "A": [[0.4, 0.0], [0.0, -2.0]]},
+    ]
+    seen = {"kind": "recorded", "path": "seen.csv", "H": [[1.0, 0.5]], "R": [[0.2]]}
+    runs = []
+    for curved in (True, False):
+        west, east = areas(curved)
+        west = {**west, "coupling": []}
+        east |= {"coupling": [], "input": drive, "schedule": changes}
+        whole = {
+            "plants": [west, east],
+            "sensors": [{**seen, "of": "west", "nodes": [1]}, {**seen, "of": "east", "nodes": [2]}],
+            "network": {"graph": {"kind": "edges", "edges": [[1, 2]]}},
+            "filter": {"kind": "central", "model": model},
+        }
+        runs.append(netkf.simulate(scenario.replace(whole), engine=engine))
+    np.testing.assert_allclose(runs[0].P, runs[1].P, rtol=1e-7)
+    np.testing.assert_allclose(runs[0].xhat, runs[1].xhat, atol=1e-7)
+
+
+@pytest.mark.parametrize("curved", [True, False])
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"schedule": [{"from": 1.0, "G": [[1.0], [0.5]]}]}, "belongs to a plant with an input"),
+        ({"schedule": [{"from": 1.0, "G": [[1.0, 0.0]] * 2}], "input": DRIVE}, "must be 2 x 1"),
+    ],
+)
+def test_gains_of_changes_are_those_of_the_input(scenario, curved, keys, words):
+    """A G without an input was ignored."""
+    plants = poses(period=0.5, Q=Q_POSE.tolist()) if curved else []
+    block = {"name": "target", "F": F_TARGET.tolist(), "Q": Q_TARGET.tolist(), "period": 0.5}
+    sensors = [] if not curved else scenario.sensors[:1]
     with pytest.raises(netkf.ScenarioError) as caught:
-        scenario.replace({"plants": [*plants, target]})
-    wanted = f"plants[{len(plants)}].schedule: must be left out where blocks are not linear"
-    assert str(caught.value).startswith(wanted)
-    assert "\n" not in str(caught.value)
+        scenario.replace({"plants": [*plants, {**block, **keys}], "sensors": sensors})
+    assert str(caught.value).startswith(f"plants[{len(plants)}].schedule[0].G: {words}")
 
 
 def test_the_derivative_of_a_prediction_is_taken_at_the_estimate(tmp_path):
