@@ -22,6 +22,7 @@ from netkf.checks.exact import EXACT_TOLERANCE
 from netkf.checks.paper import PaperChecks
 from netkf.checks.points import check_slots, sampled_indices
 from netkf.checks.samples import RunSamples
+from netkf.core.errors import TheoryError
 from netkf.theory.track_fusion.steady_errors import tracks_in_slots
 
 START_FACTOR, STEADY_TOLERANCE = 10.0, 1e-3
@@ -35,6 +36,8 @@ def check_steady(samples: RunSamples, level: float) -> Finding:
     ``early``, with the horizon that suffices, while the initial P may still matter.
     """
     radius, steady = tracks_in_slots(samples.scenario)
+    if steady is None:
+        raise TheoryError(f"tracks have no steady covariance: their radius is {radius:.6g}")
     expected = steady[sampled_indices(samples.scenario)]
     # The effect of the start shrinks by the spectral radius in each slot.
     remaining = radius ** check_slots(samples.scenario)[-1]

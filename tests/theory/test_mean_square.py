@@ -630,3 +630,20 @@ def test_thirty_scenarios_against_many_runs(tmp_path):
     z = compare(range(31), 100_000, tmp_path)
     assert len(z) >= 100
     assert np.abs(z).max() < 5.0
+
+
+@pytest.mark.parametrize(("growth", "known"), [(0.9, True), (1.0, False), (1.1, False)])
+def test_tracks_of_blind_nodes_have_a_steady_mean_square_if_the_plant_decays(
+    tmp_path, growth, known
+):
+    plant = {"kind": "linear", "F": [[growth]], "Q": [[0.1]], "cov": [[1.0]], "period": 1.0}
+    sensors = [{"nodes": [0], "H": [[1.0]], "R": [[1.0]]}]
+    tracks = {"kind": "track-fusion", "rule": "cross-covariance"}
+    scenario = slots(tracks, tmp_path, {}, plant=plant, sensors=sensors)
+    if known:
+        found = theory.steady_error_covariance(scenario)
+        np.testing.assert_allclose(found[2], 0.1 / (1.0 - growth**2), rtol=1e-9)
+        return
+    with pytest.raises(netkf.TheoryError, match="not below 1, and errors grow in the mean square"):
+        theory.steady_error_covariance(scenario)
+    assert "no steady mean square" in promises_text(scenario, compute_promises(scenario))

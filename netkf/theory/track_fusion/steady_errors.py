@@ -16,7 +16,7 @@ import numpy as np
 from netkf.algorithms.track_fusion import best_combination
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, square_root
-from netkf.linalg.spectra import growth_factor
+from netkf.linalg.spectra import contracts, growth_factor
 from netkf.network.matchings import Broadcast
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import lacks_channel_law, no_channel_law
@@ -27,9 +27,9 @@ MAX_NEIGHBOURS = 10
 """Neighbours whose messages may be lost, all sets of which are looked at."""
 
 
-def tracks_in_slots(scenario: Scenario) -> tuple[float, FloatArray]:
+def tracks_in_slots(scenario: Scenario) -> tuple[float, FloatArray | None]:
     """Return the largest spectral radius of ``C F (x) C F``, C = I - K H, and the steady
-    covariances (N, n, n) of what nodes show. Raises TheoryError.
+    covariances (N, n, n) of what nodes show, None unless it is below 1. Raises TheoryError.
     """
     if not isinstance(scenario.network.activation, Broadcast):
         raise TheoryError("the exchanges are recorded: one outcome, not a law")
@@ -38,12 +38,16 @@ def tracks_in_slots(scenario: Scenario) -> tuple[float, FloatArray]:
     if not scenario.filters_know_the_truth:
         raise TheoryError("the filters' model is not the true one")
     joint, radius = steady_tracks(scenario)
+    if joint is None:
+        return radius, None
     nodes = range(len(scenario.nodes))
     return radius, np.stack([_mean_reported_covariance(scenario, joint, i) for i in nodes])
 
 
-def steady_tracks(scenario: Scenario) -> tuple[FloatArray, float]:
-    """Return the joint covariances (N, N, n, n) of the errors of steady tracks, and the radius."""
+def steady_tracks(scenario: Scenario) -> tuple[FloatArray | None, float]:
+    """Return the joint covariances (N, N, n, n) of the errors of steady tracks, None unless the
+    radius is below 1, and the radius.
+    """
     (F, Q), n = scenario.slot_belief, scenario.plant.n
     closed, noises = [], []
     for node in scenario.nodes:
@@ -51,6 +55,9 @@ def steady_tracks(scenario: Scenario) -> tuple[FloatArray, float]:
         K = steady_gain(F, Q, H, R)
         closed.append(np.eye(n) - K @ H)
         noises.append(K @ R @ K.T)
+    radius = max(growth_factor(C @ F) for C in closed) ** 2
+    if not contracts(radius):
+        return None, radius
     joint = np.zeros((len(closed), len(closed), n, n))
     for (i, C), (j, D) in combinations_with_replacement(enumerate(closed), 2):
         # P_ij = C_i (F P_ij F' + Q) C_j' + [i = j] K R K', solved by vectorisation.
@@ -58,8 +65,7 @@ def steady_tracks(scenario: Scenario) -> tuple[FloatArray, float]:
         block = np.linalg.solve(np.eye(n * n) - np.kron(C @ F, D @ F), driven.reshape(-1))
         joint[i, j] = block.reshape(n, n)
         joint[j, i] = block.reshape(n, n).T
-    radius = max(growth_factor(C @ F) for C in closed)
-    return joint, radius**2
+    return joint, radius
 
 
 def _mean_reported_covariance(scenario: Scenario, joint: FloatArray, i: int) -> FloatArray:
