@@ -591,6 +591,8 @@ def node_id(low: int | None = None, high: int | None = None) -> Rule:
     def convert(value: Any) -> int | str:
         if not isinstance(value, str):
             node: int = ids.convert(value)
+            if abs(node) > 2**53:  # tables and arrays hold ids as numbers of 64 bits
+                raise _SpecificError("must be an integer from 0 to 2^53", "correct it")
             # Ids of nodes with names are integers of a class of their own.
             return value if isinstance(value, int) else node
         if not value.strip() or len(value) > MAX_NAME or not value.isprintable():

@@ -396,8 +396,10 @@ class ErdosRenyi(RandomGraph):
 
         # Refuse a graph whose expected number of links is too large before it is drawn.
         _check_size(self.nodes, int(0.5 * self.p * self.nodes * (self.nodes - 1)))
+        # networkx divides by log(1 - p).
+        p = self.p if 1.0 - self.p < 1.0 else 0.0
         return _from_networkx(
-            self._draw(seed, lambda s: networkx.fast_gnp_random_graph(self.nodes, self.p, s))
+            self._draw(seed, lambda s: networkx.fast_gnp_random_graph(self.nodes, p, s))
         )
 
 

@@ -14,6 +14,8 @@ from netkf.core.fields import Component, field, integer, number, one_of, positiv
 from netkf.linalg.arrays import FloatArray
 from netkf.network.lives import lifetimes
 
+MAX_BYTES = 1_000_000_000
+
 
 @dataclass(frozen=True, eq=False)
 class Radio(Component):
@@ -31,8 +33,8 @@ class Radio(Component):
 
     bits_per_second: float | None = field(positive, default=None)
     queue: str = field(one_of("wait", "drop"), default="wait")
-    frame_bytes: int | None = field(integer(low=1), default=None)
-    bytes_per_number: int = field(integer(low=1), default=8)
+    frame_bytes: int | None = field(integer(1, MAX_BYTES), default=None)
+    bytes_per_number: int = field(integer(1, MAX_BYTES), default=8)
 
     def seconds(self, size: float) -> float:
         """Return how long a message of ``size`` bytes is sent."""

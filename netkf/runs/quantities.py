@@ -80,7 +80,7 @@ def sample_quantities(scenario: Scenario, squares: FloatArray) -> FloatArray:
             )
             values = np.where(low == high, low, low + (places - below) * (high - low))
             if metrics.level is not None:
-                above = (ordered > metrics.level**2).mean(axis=-1, keepdims=True)
+                above = (ordered > metrics.level * metrics.level).mean(axis=-1, keepdims=True)
                 values = np.concatenate([values, above], axis=-1)
         part[:] = np.where(np.isnan(last), np.nan, values)
     return found

@@ -328,6 +328,11 @@ def test_the_normalised_outer_product_of_gaussians(seed):
     )
 
 
+def test_regressors_beyond_the_range_of_numbers_have_no_product():
+    with pytest.raises(netkf.TheoryError, match="beyond the range of numbers"):
+        normalised_outer(np.array([[1e200]]), np.eye(1))
+
+
 @pytest.mark.parametrize("size", [1.0, 1e3, 1e6, 1e10, 1e100])
 def test_the_normalised_outer_product_holds_for_regressors_in_any_unit(size):
     fixed = normalised_outer(np.array([[size]]), np.zeros((1, 1))).item()

@@ -469,3 +469,9 @@ def test_both_engines_and_ensembles_agree(tmp_path):
 
 
 LOSS = {"kind": "bernoulli", "delivery": 0.7}
+
+
+def test_no_error_is_above_a_level_whose_square_is_beyond_the_range_of_numbers():
+    scenario = netkf.load(SCENARIOS / "poisson_ring.toml", {"metrics.level": 1e300})
+    found = sample_quantities(scenario, np.ones((len(scenario.times), len(scenario.nodes))))
+    assert (found[:, -1] == 0.0).all()

@@ -857,6 +857,14 @@ SETTINGS = [
     ("entry", "sensors[0].R=[[-1.0]]", "sensors[0].R", "(least eigenvalue -1); got [[-1.0]]"),
     ("delivery", f"{L}.delivery=2", f"{L}.delivery", "at most 1; got 2"),
     ("kind", "filter.kind=kalman", "filter.kind", "got 'kalman'"),
+    ("huge-id", f"sensors.0.nodes=[{10**400}]", "sensors[0].nodes[0]", "from 0 to 2^53"),
+    ("huge-frame", f"network.radio={{frame_bytes={10**400}}}", "network.radio.frame_bytes", "most"),
+    (
+        "never-linked",
+        'network.graph={kind="erdos-renyi",nodes=6,p=1e-300,connected=true}',
+        "network.graph.connected",
+        "none of 1000 graphs drawn was connected",
+    ),
     ("table", "plant=5", "plant", "must be a table; got 5"),
     ("lines", "a\nb=1", r"a\nb", "is not a key here; got 1"),
 ]

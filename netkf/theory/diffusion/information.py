@@ -252,6 +252,8 @@ def normalised_outer(mean: FloatArray, cov: FloatArray) -> FloatArray:
     # In the axes of the covariance the entries of phi are independent.
     m = mean @ axes
     size = np.log1p((m * m).sum(axis=1).max(initial=0.0) + spread.sum())
+    if not np.isfinite(size):
+        raise TheoryError("regressors grow beyond the range of numbers")
     u = np.exp(np.arange(LOWER - np.ceil(size), UPPER, STEP))
     # In the axes of cov, exp(-u |phi|^2) divides means and variances by D.
     D = 1.0 + 2.0 * u[:, None] * spread
