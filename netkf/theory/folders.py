@@ -53,7 +53,7 @@ class PaperTheory:
     error_columns: Callable[[Scenario, Run], ErrorColumns] | None = None
     slot_jumps: Callable[[Scenario], LinearErrors] | None = None
     clock_jumps: Callable[[Scenario], LinearErrors] | None = None
-    steady_slots: Callable[[Scenario], tuple[float, FloatArray]] | None = None
+    steady_slots: Callable[[Scenario], tuple[float, FloatArray | None]] | None = None
     slot_promises: Callable[[Scenario], dict[str, Any]] | None = None
     slot_lines: Callable[[dict[str, Any], Callable[[Any], str]], list[str]] | None = None
 

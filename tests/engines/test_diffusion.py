@@ -328,9 +328,11 @@ def test_the_normalised_outer_product_of_gaussians(seed):
     )
 
 
-def test_regressors_beyond_the_range_of_numbers_have_no_product():
+def test_regressors_beyond_the_range_of_numbers_have_no_level():
+    scenario = netkf.load(SCENARIOS / "diffusion_regression.toml")
+    growing = np.asarray(scenario.sensors[0].A) * 1e11
     with pytest.raises(netkf.TheoryError, match="beyond the range of numbers"):
-        normalised_outer(np.array([[1e200]]), np.eye(1))
+        netkf.theory.information_level(scenario.replace({"sensors.0.A": growing.tolist()}))
 
 
 @pytest.mark.parametrize("size", [1.0, 1e3, 1e6, 1e10, 1e100])

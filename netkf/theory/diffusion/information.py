@@ -26,6 +26,7 @@ from netkf.theory.numerics.matrices import as_integer, as_number
 if TYPE_CHECKING:
     import pandas as pd
 
+OVERFLOW = 1e100  # of means and covariances of regressors
 STEP, LOWER, UPPER = 0.25, -40.0, 4.0
 """Trapezoidal rule in log u for the integral of f(u) exp(-u) over u > 0. Outside of these limits
 lies less than rounding: u exp(-u) is 4e-18 at the lower one and 1e-17 at the upper one. Where
@@ -239,8 +240,11 @@ def _window_excitation(source: _Source, states: FloatArray, window: int) -> Floa
     mean, cov, n = states, np.zeros_like(source.A), len(source.C)
     total = np.zeros((len(states), n, n))
     for _ in range(window):  # mean and covariance of s in each slot
-        mean = mean @ source.A.T
-        cov = source.A @ cov @ source.A.T + (source.drive if source.drive.size else 0.0)
+        with np.errstate(over="ignore", invalid="ignore"):
+            mean = mean @ source.A.T
+            cov = source.A @ cov @ source.A.T + (source.drive if source.drive.size else 0.0)
+        if not max(np.abs(mean).max(initial=0.0), np.abs(cov).max(initial=0.0)) < OVERFLOW:
+            raise TheoryError("regressors grow beyond the range of numbers")
         total = total + normalised_outer(mean @ source.C.T, source.C @ cov @ source.C.T)
     return total
 
@@ -252,8 +256,6 @@ def normalised_outer(mean: FloatArray, cov: FloatArray) -> FloatArray:
     # In the axes of the covariance the entries of phi are independent.
     m = mean @ axes
     size = np.log1p((m * m).sum(axis=1).max(initial=0.0) + spread.sum())
-    if not np.isfinite(size):
-        raise TheoryError("regressors grow beyond the range of numbers")
     u = np.exp(np.arange(LOWER - np.ceil(size), UPPER, STEP))
     # In the axes of cov, exp(-u |phi|^2) divides means and variances by D.
     D = 1.0 + 2.0 * u[:, None] * spread
