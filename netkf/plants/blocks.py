@@ -7,6 +7,7 @@ one after the other: that of a scenario with ``[[plants]]`` is an ordinary plant
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -320,25 +321,16 @@ def _stack_nonlinear(blocks: Sequence[Block], layout: Layout) -> Plant:
         if not block.plant.linear:
             with errors_under(f"[{k}]"):
                 block.copies[0].check_dynamics()
-    plants, parts, inputs = _plants(blocks), list[BlockPart](), list[Input]()
-    for plant in plants:
-        of_plant = [plant.input] if plant.input is not None else []
-        matrices = gains = None
-        if plant.linear:
-            matrices = np.array([getattr(one, "F" if slotted else "A") for one in plant.pieces])
-            gains = np.array(plant.input_gains) if of_plant else None
-            if len(matrices) > 1:
-                of_plant.append(PieceNumber(times=plant.schedule_times))
-        m = sum(one.m for one in of_plant)
-        parts.append(BlockPart(None if plant.linear else plant.f, plant.n, m, matrices, gains))
-        inputs += of_plant
+    plants = _plants(blocks)
+    parts, inputs_of_parts = zip(*map(_part, plants), strict=True)
+    inputs = tuple(itertools.chain(*inputs_of_parts))
     coupling = np.zeros((layout.n, layout.n))
     _add_couplings(coupling, blocks, layout)
     shared: dict[str, Any] = {
-        "f": StackedDynamics(tuple(parts), coupling),
+        "f": StackedDynamics(parts, coupling),
         "mean": np.concatenate([plant.start_mean for plant in plants]),
         "cov": block_diagonal([plant.start_cov for plant in plants]),
-        "input": StackedInput(inputs=tuple(inputs)) if inputs else None,
+        "input": StackedInput(inputs=inputs) if inputs else None,
     }
     if not all(plant.is_random for plant in plants):
         shared["path"] = StackedStates(plants)
@@ -353,6 +345,19 @@ def _stack_nonlinear(blocks: Sequence[Block], layout: Layout) -> Plant:
         return NonlinearPlant(Q=noise, period=_one(blocks, "period"), **shared)
     curved = [block for block in blocks if not block.plant.linear]
     return NonlinearDiffusion(B=noise, step=_one(curved, "step"), **shared)
+
+
+def _part(plant: Any) -> tuple[BlockPart, list[Input]]:
+    """Return the dynamics of a block beside others that are not linear, and what drives it."""
+    inputs: list[Input] = [] if plant.input is None else [plant.input]
+    if not plant.linear:
+        return BlockPart(plant.f, plant.n, sum(u.m for u in inputs)), inputs
+    gains = np.array(plant.input_gains) if inputs else None
+    if len(plant.pieces) > 1:
+        inputs.append(PieceNumber(times=plant.schedule_times))
+    name = "F" if isinstance(plant, SlotPlant) else "A"
+    matrices = np.array([getattr(piece, name) for piece in plant.pieces])
+    return BlockPart(None, plant.n, sum(u.m for u in inputs), matrices, gains), inputs
 
 
 def _noise_at(plant: Any, name: str, time: float) -> FloatArray:
