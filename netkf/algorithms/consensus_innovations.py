@@ -266,10 +266,7 @@ def gain_sequence(
 
 @lru_cache(maxsize=8)
 def _shared_sequence(
-    n: int,
-    entries: tuple[bytes, ...],
-    heard: tuple[tuple[int, ...], ...],
-    changes: tuple[int, ...],
+    n: int, entries: tuple[bytes, ...], heard: tuple[tuple[int, ...], ...], changes: tuple[int, ...]
 ) -> GainSequence:
     F, Q, cov, information = (np.frombuffer(part).reshape(-1, n, n) for part in entries)
     return GainSequence((F, Q, cov[0]), information, heard, changes)

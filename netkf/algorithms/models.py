@@ -20,12 +20,7 @@ import numpy as np
 from netkf.algorithms.kernels.estimates import transform_root, update_by_row
 from netkf.algorithms.kernels.gains import GainTable, gain_table
 from netkf.algorithms.kernels.maps import MapTables, move_estimate, spread_of
-from netkf.algorithms.kernels.rates import (
-    DIFFERENCE,
-    RateTables,
-    move_by_rate,
-    scratch_of_rates,
-)
+from netkf.algorithms.kernels.rates import DIFFERENCE, RateTables, move_by_rate, scratch_of_rates
 from netkf.algorithms.kernels.root_flow import FlowTable, flow_root, flow_table, gain_update_root
 from netkf.algorithms.kernels.run import CLOSE, usable
 from netkf.algorithms.kernels.square_root import lower_root

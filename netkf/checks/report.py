@@ -33,23 +33,20 @@ def verdict_text(verdict: Verdict, claim: str = "", command: str = "", full: boo
             lines += textwrap.wrap(message, WIDTH, initial_indent=INDENT, subsequent_indent=INDENT)
         else:
             lines.append(INDENT + textwrap.shorten(_summarise_row(row), WIDTH, placeholder=" ..."))
-    lines += [
-        *_computed_lines(folded),
-        "",
-        *paper_legend(row.source for row in verdict.rows),
-        *_summary_lines(verdict),
-    ]
+    if folded:
+        listed = "; ".join(f"{row.promise} [{row.source}]: {row.verdict}" for row in folded)
+        text = f"{'computed':<{len(INDENT)}}no run can break these: {listed}"
+        lines += textwrap.wrap(text, len(INDENT) + WIDTH, subsequent_indent=INDENT)
+    lines += ["", *paper_legend(row.source for row in verdict.rows), *_summary_lines(verdict)]
     if not full:
         lines.append("detectable: an error found with probability 0.9; --all shows all evidence")
-    return "\n".join([*lines, *_broken_again(broken, command)])
-
-
-def _computed_lines(rows: list[Evidence]) -> list[str]:
-    if not rows:
-        return []
-    listed = "; ".join(f"{row.promise} [{row.source}]: {row.verdict}" for row in rows)
-    text = f"{'computed':<{len(INDENT)}}no run can break these: {listed}"
-    return textwrap.wrap(text, len(INDENT) + WIDTH, subsequent_indent=INDENT)
+    lines += [""] if broken else []
+    for row in broken:
+        values = f": seen {row.seen:.4g}, expected {row.expected:.4g}"
+        lines.append(f"BROKEN: {row.promise}  [{row.source}]{values}")
+        if command and row.replica is not None:
+            lines.append(f"        replay it: {command} {row.replica}")
+    return "\n".join(lines)
 
 
 def _summary_lines(verdict: Verdict) -> list[str]:
@@ -65,16 +62,6 @@ def _summary_lines(verdict: Verdict) -> list[str]:
             "--until decided"
         )
     return lines
-
-
-def _broken_again(broken: list[Evidence], command: str) -> list[str]:
-    lines = []
-    for row in broken:
-        values = f": seen {row.seen:.4g}, expected {row.expected:.4g}"
-        lines.append(f"BROKEN: {row.promise}  [{row.source}]{values}")
-        if command and row.replica is not None:
-            lines.append(f"        replay it: {command} {row.replica}")
-    return ["", *lines] if lines else []
 
 
 def _describe_row(row: Evidence) -> str:

@@ -255,12 +255,7 @@ def number(
     if bounds:
         requirement = f"{requirement} {' and '.join(bounds)}"
         remedy = f"give a number {' and '.join(bounds)}"
-    limits = {
-        "exclusiveMinimum": above,
-        "minimum": low,
-        "exclusiveMaximum": below,
-        "maximum": high,
-    }
+    limits = {"exclusiveMinimum": above, "minimum": low, "exclusiveMaximum": below, "maximum": high}
     finite_limits = {name: limit for name, limit in limits.items() if math.isfinite(limit)}
     return Rule(requirement, convert, remedy, {"type": "number", **finite_limits})
 

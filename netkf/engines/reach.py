@@ -10,9 +10,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Link
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN
-from netkf.trace.schema import CODES
-
-LINK = CODES["link"]
+from netkf.trace.schema import LINK
 
 
 class Reach:

@@ -17,11 +17,7 @@ from netkf.linalg.compiling import seconds_spent
 from netkf.runs.failures import explain_failure
 from netkf.runs.provenance import versions
 from netkf.scenario.imports import unload_namesake
-from netkf.scenario.plugins import (
-    find_unimportable_class,
-    unguarded_line,
-    user_components,
-)
+from netkf.scenario.plugins import find_unimportable_class, unguarded_line, user_components
 from netkf.scenario.scenario import Scenario
 
 Task = Callable[[Scenario, int, int], Any]

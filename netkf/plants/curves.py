@@ -153,11 +153,7 @@ class CurvePath(WithoutFrames):
                 x = self._states[stop] = plant.move(x, begin, stop - begin, noise)
 
     def _cut(
-        self,
-        x: FloatArray,
-        ends: tuple[float, float],
-        noise: FloatArray,
-        inner: list[FloatArray],
+        self, x: FloatArray, ends: tuple[float, float], noise: FloatArray, inner: list[FloatArray]
     ) -> None:
         """Write the states at the times inside a step, in which x (n,) moves with the ``noise``."""
         pieces = self._divide(ends, noise, inner[0].tolist(), self._streams[0])

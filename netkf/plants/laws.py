@@ -17,12 +17,7 @@ from netkf.linalg.arrays import FloatArray, symmetric
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES
 from netkf.linalg.legendre import forward_coefficients
-from netkf.linalg.portable import (
-    gauss_legendre,
-    product,
-    pseudo_inverse,
-    symmetric_root,
-)
+from netkf.linalg.portable import gauss_legendre, product, pseudo_inverse, symmetric_root
 from netkf.linalg.series import exponential_terms, polynomial, with_reach
 from netkf.linalg.small import matmul
 from netkf.linalg.spectra import balanced_norm

@@ -513,13 +513,9 @@ class DiffusionPath:
         step = self._at(time)
         assert time in (step.start, step.end), f"{time} is neither on the grid nor probed"
         # The step that ends at the frame time is in coordinates of the previous frame.
-        if self._begins_frame(time):
+        if (self.frame_times == time).any():
             return np.zeros(self.laws.n)
         return step.x_end if time == step.end else step.x_start
-
-    def _begins_frame(self, time: float) -> bool:
-        k = int(np.searchsorted(self.frame_times, time))
-        return k < len(self.frame_times) and bool(self.frame_times[k] == time)
 
     def rebase(self, k: int) -> FloatArray:
         """Return the local state (n,) just before ``frame_times[k]``, the new origin."""

@@ -60,10 +60,7 @@ class RegressorReadings(SlotReadings):
     """The readings of one regressor sensor on one node, one a slot."""
 
     def __init__(
-        self,
-        sensor: RegressorSensor,
-        random: np.random.Generator,
-        driving: np.random.Generator,
+        self, sensor: RegressorSensor, random: np.random.Generator, driving: np.random.Generator
     ) -> None:
         """Draw the noise of readings from ``random`` and the regressor's state from ``driving``."""
         super().__init__(sensor.H, sensor.R, random)

@@ -152,14 +152,10 @@ def decimal_below(bound: float) -> float:
     return float(f"{digit * power:.12g}")
 
 
-def _round_seconds(seconds: float) -> float:
-    # Frames must not depend on the last bits of an eigenvalue, which differ between machines.
-    return float(f"{seconds:.9g}")
-
-
 def frame_slots(F: FloatArray) -> int | None:
     """Return the length of a frame in slots, in which states of ``x[k+1] = F x[k]``, F (n, n), grow
     at most 2^10-fold, or 1; None if they do not grow.
     """
     factor = growth_factor(F)
-    return max(1, int(_round_seconds(GROWTH / math.log(factor)))) if factor > 1.0 else None
+    # Frames must not depend on the last bits of an eigenvalue, which differ between machines.
+    return max(1, int(float(f"{GROWTH / math.log(factor):.9g}"))) if factor > 1.0 else None

@@ -20,16 +20,7 @@ import numpy as np
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.structs import Size
-from netkf.rng.draws import (
-    LAYER,
-    ONE,
-    S8,
-    Ziggurat,
-    next_exponential,
-    next_unit,
-    next_word,
-    philox,
-)
+from netkf.rng.draws import LAYER, ONE, S8, Ziggurat, next_exponential, next_unit, next_word, philox
 from netkf.rng.streams import BLOCK_WORDS, HALF
 
 _U = np.uint64

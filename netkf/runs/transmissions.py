@@ -10,10 +10,7 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.trace.recorder import Sink
-from netkf.trace.schema import CODES, KINDS
-
-SEND = CODES["send"]
-TRANSMIT = KINDS.index("transmit")
+from netkf.trace.schema import SEND, TRANSMIT
 
 MAX_BLOCKS = 8
 """Blocks of pairs that are kept before they are merged."""

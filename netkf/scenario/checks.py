@@ -15,7 +15,6 @@ from netkf.algorithms.kernels.gains import longest_interval
 from netkf.algorithms.kernels.run import absorb as nothing
 from netkf.core.clock import stated_rate
 from netkf.core.errors import ScenarioError, errors_under
-from netkf.core.fields import Component
 from netkf.core.printable import list_some
 from netkf.linalg.spectra import growth_rate
 from netkf.network.clocks import LinkClock
@@ -511,10 +510,14 @@ def _check_slots(scenario: DerivedScenario) -> None:
     if is_matching != node_filter.timing.pairwise:
         assert activation is not None
         form = "matching" if node_filter.timing.pairwise else "broadcast"
+        given = kind_name(activation, "activation")
+        if recorded is not None:
+            what = "slot,node,peer: a matching" if recorded.matching else "phase,step: broadcasts"
+            given = f"{given} ({what})"
         raise ScenarioError(
             "network.activation.kind",
             f"must be a {form} for the {filter_name(scenario)}",
-            _describe_activation(activation),
+            given,
             "choose another activation or another filter",
         )
     exchanges = (node_filter.timing.schedule or ()).count("exchange")
@@ -522,11 +525,3 @@ def _check_slots(scenario: DerivedScenario) -> None:
         rule = f"must leave {exchanges} exchange(s) room within the period {plant.period:g}"
         remedy = "shorten it; the steps of an exchange share it"
         raise ScenarioError("network.activation.phase", rule, scenario.phase_length, remedy)
-
-
-def _describe_activation(activation: Component) -> str:
-    name = kind_name(activation, "activation")
-    if not isinstance(activation, RecordedSlots):
-        return name
-    columns = "slot,node,peer: a matching" if activation.matching else "phase,step: broadcasts"
-    return f"{name} ({columns})"

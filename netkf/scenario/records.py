@@ -158,11 +158,7 @@ def count_state_rows(scenario: DerivedScenario) -> dict[str, RowUse]:
     if scenario.plant.record is None:
         return {}
     return _sum_by_key(
-        (
-            key,
-            plant.record.columns,
-            plant.record.use(_state_times(scenario, place).tolist()),
-        )
+        (key, plant.record.columns, plant.record.use(_state_times(scenario, place).tolist()))
         for (key, plant), place in zip(scenario.all_plants, scenario.layout.places, strict=True)
         if plant.record is not None
     )

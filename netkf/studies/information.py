@@ -22,7 +22,7 @@ import numpy as np
 from netkf.network.deliveries import MessageKey
 from netkf.scenario.derived import DerivedScenario
 from netkf.trace.messages import DELIVERED, MESSAGE, join_messages
-from netkf.trace.schema import CODES
+from netkf.trace.schema import ABSORB, CRASH, JOIN, LEAVE, RESTART, SENSE, SWAP
 
 IntArray = np.ndarray
 Messages = np.recarray
@@ -34,10 +34,8 @@ refused ones were too old for the filter, unused ones were replaced by another m
 instant, or their receiver went down before it used them.
 """
 USED, LOST, LATE, REFUSED, UNDER_WAY, UNUSED = range(len(OUTCOMES))
-SLEEPS, WAKES = (
-    frozenset(CODES[kind] for kind in kinds) for kinds in (("crash", "leave"), ("restart", "join"))
-)
-ENDS = ("absorb", "swap", "crash", "leave")
+SLEEPS, WAKES = frozenset((CRASH, LEAVE)), frozenset((RESTART, JOIN))
+ENDS = (ABSORB, SWAP, CRASH, LEAVE)
 """Kinds of events after which nothing that arrived before waits at a node."""
 
 
@@ -63,7 +61,7 @@ def match_messages(log: IntArray, swaps: bool, slotted: bool) -> Messages:
     used_row = np.full(len(joined), NEVER)
     arrivals = np.flatnonzero(joined["outcome"] == DELIVERED)
     used_row[arrivals] = _next_use(log, joined["end_row"][arrivals])
-    stopped = arrivals[np.isin(log["kind"][used_row[arrivals]], [CODES["crash"], CODES["leave"]])]
+    stopped = arrivals[np.isin(log["kind"][used_row[arrivals]], [CRASH, LEAVE])]
     # By outcome in the log: DELIVERED, LOST, LATE, UNDER_WAY.
     outcome = np.array([USED, LOST, LATE if slotted else REFUSED, UNDER_WAY])[joined["outcome"]]
     outcome[stopped] = UNUSED
@@ -87,7 +85,7 @@ def _next_use(log: IntArray, rows: IntArray) -> IntArray:
     """Return the rows (K,) at which nodes use arrivals at ``rows``, or go down; NEVER without."""
     # One sorted search for all nodes: keys order the uses by node, then by row of the log. The
     # result may be a use by the following node, which the last line rejects.
-    uses = np.flatnonzero(np.isin(log["kind"], [CODES[kind] for kind in ENDS]))
+    uses = np.flatnonzero(np.isin(log["kind"], ENDS))
     ids, length = np.unique(log["node"]), len(log) + 1
     keys = np.searchsorted(ids, log["node"][uses]) * length + uses
     order = np.argsort(keys)
@@ -260,7 +258,7 @@ class KeptReadings:
 
     def __init__(self, scenario: DerivedScenario, log: IntArray, at: float) -> None:
         self._scenario, self._times, self._at = scenario, log["t"], at
-        sensed = np.flatnonzero(log["kind"] == CODES["sense"])
+        sensed = np.flatnonzero(log["kind"] == SENSE)
         self._changes: dict[int, list[tuple[int, int]]] = {}
         for row in np.flatnonzero(np.isin(log["kind"], (*SLEEPS, *WAKES))).tolist():
             self._changes.setdefault(int(log["node"][row]), []).append((row, int(log["kind"][row])))

@@ -309,9 +309,12 @@ def _whiteness(columns: list[FloatArray], level: float) -> _Whiteness:
     columns = [column for column in columns if len(column) >= MIN_READINGS]
     if not columns:
         return _Whiteness(math.nan, 0, math.nan, math.nan)
-    correlation = _detectable_correlation(sum(map(len, columns)), lags * len(columns), level)
+    freedom, count = lags * len(columns), sum(map(len, columns))
+    # At one lag, of which the test has this probability of finding it.
+    critical = 2.0 * float(gammaincinv(0.5 * freedom, 1.0 - 0.1 * level))
+    correlation = math.sqrt(float(chndtrinc(critical, freedom, 1.0 - POWER)) / count)
     statistic, p = whiteness_p(columns, lags, level)
-    return _Whiteness(statistic, lags * len(columns), p, correlation)
+    return _Whiteness(statistic, freedom, p, min(1.0, correlation))
 
 
 def _ends_of(stretch: Stretch, times: FloatArray) -> tuple[float, float]:
@@ -360,12 +363,6 @@ def _bias(
         if best[3] < 0 or abs(bias) / reach > abs(best[0]) / best[1]:
             best = bias, reach, reach + float(ndtri(POWER)) * error, c
     return best
-
-
-def _detectable_correlation(count: int, freedom: int, level: float) -> float:
-    """Return the correlation at one lag that Ljung and Box's test finds with probability POWER."""
-    critical = 2.0 * float(gammaincinv(0.5 * freedom, 1.0 - 0.1 * level))
-    return min(1.0, math.sqrt(float(chndtrinc(critical, freedom, 1.0 - POWER)) / count))
 
 
 def format_innovations(tests: InnovationTests, full: bool = True) -> str:

@@ -54,6 +54,9 @@ join, leave  as restart and crash, of a node that a table lets join and leave th
 
 CODES = {kind: code for code, kind in enumerate(KINDS)}
 
+(SENSE, TICK, SEND, DELIVER, LOST, LATE, ABSORB, SWAP, ROUND, STOP, CRASH, RESTART, DIVERGED,
+ TRANSMIT, LINK, JOIN, LEAVE, REFUSE, CLIP) = range(len(KINDS))  # fmt: skip
+
 EVENT = np.dtype(
     [
         ("t", "<f8"),

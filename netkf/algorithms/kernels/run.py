@@ -214,11 +214,7 @@ def opposite_links(first: IntArray, sender: IntArray) -> IntArray:
 
 
 def clock_tables(
-    size: Size,
-    table: FlowTable,
-    models: IntArray,
-    gains: Gains,
-    changes: FloatArray = NO_CHANGES,
+    size: Size, table: FlowTable, models: IntArray, gains: Gains, changes: FloatArray = NO_CHANGES
 ) -> ClockTables:
     """Return the models of H nodes under clocks for a run of this ``size``, with scratch: the
     ``table`` of M models and the ``gains`` of theirs, and the index ``models`` (H,) of each node's;

@@ -7,7 +7,6 @@ no two ticks are at one time: all messages of a tick are absorbed before the nex
 from __future__ import annotations
 
 import math
-from functools import cache
 
 import numpy as np
 
@@ -89,6 +88,9 @@ _POSITIONS = (
 PROGRESS = np.dtype([(name, np.int64) for name in _POSITIONS])
 """The position of a run that is interrupted, see Simulation."""
 
+NO_PROGRESS = np.zeros(0, dtype=PROGRESS)
+"""No records: ``simulate_agenda`` then simulates one run."""
+
 
 @once_per_scenario
 def is_immediate(scenario: Scenario) -> bool:
@@ -162,13 +164,7 @@ def simulate_single_run(state: Simulation, visits: Visits) -> int:
     """Simulate one run until it needs something from Python; return the request (WANT_... or DONE).
     Changes ``state``, the run; ``visits`` is an empty queue, and empty again after the call.
     """
-    return int(simulate_agenda(state, visits.memory, no_batch().memory, _no_progress(), math.inf))
-
-
-@cache
-def _no_progress() -> np.ndarray:
-    """Return no PROGRESS records: ``simulate_agenda`` then simulates one run."""
-    return np.zeros(0, dtype=PROGRESS)
+    return int(simulate_agenda(state, visits.memory, no_batch().memory, NO_PROGRESS, math.inf))
 
 
 @kernel

@@ -13,9 +13,7 @@ from netkf.engines.compiled.state import NODE, Simulation
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.structs import Struct
-from netkf.trace.schema import CODES, KINDS
-
-DIVERGED = CODES["diverged"]
+from netkf.trace.schema import DIVERGED, KINDS
 
 
 class BatchArrays(Struct):

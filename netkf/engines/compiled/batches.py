@@ -88,15 +88,12 @@ def _simulate(
         # filters with messages under way need Python, run by run.
         together, clocked = drawn_together(scenario) and not rows, workspace.clocked
         if together and clocked is not None:
-            together = not (clocked.kernels.remembers or _has_frames(scenario))
+            frames = scenario.exact_errors and frame_period(scenario.diffusion.A) is not None
+            together = not (clocked.kernels.remembers or frames)
         batch = _all_at_once(scenario, workspace, seed, replicas) if together else None
         if batch is None:
             batch = _run_by_run(scenario, workspace, seed, replicas, rows)
         return batch
-
-
-def _has_frames(scenario: Scenario) -> bool:
-    return scenario.exact_errors and frame_period(scenario.diffusion.A) is not None
 
 
 def _run_by_run(

@@ -12,12 +12,7 @@ from netkf.algorithms.kernels.gates import GateTables, gate_tables, no_gate, own
 from netkf.algorithms.kernels.nonlinear_rows import linear_rows
 from netkf.algorithms.kernels.pairs import empty_pairs, no_pairs
 from netkf.algorithms.kernels.rates import RateRun
-from netkf.algorithms.kernels.run import (
-    ClockRun,
-    clock_tables,
-    opposite_links,
-    size_of,
-)
+from netkf.algorithms.kernels.run import ClockRun, clock_tables, opposite_links, size_of
 from netkf.algorithms.models import RateModel, changing_models
 from netkf.algorithms.records import Kernels, double_past, make_records, resized
 from netkf.engines.compiled.batch_arrays import BatchArrays
@@ -26,13 +21,7 @@ from netkf.engines.compiled.nonlinear_samples import nonlinear_sensors
 from netkf.engines.compiled.quantiser import PayloadQuantiser
 from netkf.engines.compiled.samples import entries_of
 from netkf.engines.compiled.slot_pairs import PairColumns, common_table
-from netkf.engines.compiled.state import (
-    Filters,
-    Instants,
-    Simulation,
-    add_messages,
-    wide_models,
-)
+from netkf.engines.compiled.state import Filters, Instants, Simulation, add_messages, wide_models
 from netkf.linalg.addresses import any_struct, call_kernel
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.generic import copy_arrays
@@ -44,13 +33,7 @@ from netkf.scenario.scenario import Scenario
 class ClockFilters:
     """N filters of one run whose verbs are kernels, with room for C ``messages``."""
 
-    def __init__(
-        self,
-        scenario: Scenario,
-        kernels: Kernels,
-        start: Filters,
-        messages: int,
-    ) -> None:
+    def __init__(self, scenario: Scenario, kernels: Kernels, start: Filters, messages: int) -> None:
         self.kernels = kernels
         self._p = self._samples = 1
         columns = PairColumns(scenario, entries_of(scenario))
@@ -72,12 +55,7 @@ class ClockFilters:
         count, self._common = len(links["sender"]), common_table(scenario)
         self._degree = int(np.diff(links["first"]).max(initial=0))
         self.records = make_records(
-            scenario.node_filter,
-            starts,
-            infos,
-            models,
-            links=count,
-            messages=self._room(messages),
+            scenario.node_filter, starts, infos, models, links=count, messages=self._room(messages)
         )
         self.record, self.start = self.records.struct, self.records.copied()
         self.quantiser = PayloadQuantiser(scenario.network.quantise, self.records)

@@ -28,12 +28,7 @@ from netkf.plants.curves import NonlinearDiffusion
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.maps import NonlinearPlant
-from netkf.plants.recorded import (
-    RecordedDiffusion,
-    RecordedPlant,
-    UnknownDiffusion,
-    UnknownPlant,
-)
+from netkf.plants.recorded import RecordedDiffusion, RecordedPlant, UnknownDiffusion, UnknownPlant
 from netkf.plants.states import StackedStates
 from netkf.rng.streams import Streams
 from netkf.scenario.registry import name_of

@@ -38,7 +38,6 @@ from netkf.engines.compiled.samples import by_node, entries_of, record_samples
 from netkf.engines.compiled.senders import senders_of
 from netkf.engines.compiled.state import (
     CLOCKS,
-    Filters,
     Instants,
     PathBlock,
     SampleBuffer,
@@ -75,19 +74,8 @@ FIRST_MESSAGES, FIRST_ROWS = 64, 4096
 MAX_BUFFERED_SAMPLES, MAX_BUFFERED_FLOATS = 256, 1 << 18
 AT_START = (
     *("run", "first_run", "first_delay", "frame_at", "piece", "grid_at", "wake_at", "instant_at"),
-    *(
-        "life_at",
-        "tick_at",
-        "link_at",
-        "probe_at",
-        "row",
-        "first_free",
-        "in_flight",
-        "order",
-        "receivers",
-        "absorbing",
-    ),
-    *("clipped", "samples"),
+    *("life_at", "tick_at", "link_at", "probe_at", "row", "first_free", "in_flight", "order"),
+    *("receivers", "absorbing", "clipped", "samples"),
 )
 """Integer fields of a Simulation that are 0 when a run begins."""
 
@@ -158,14 +146,14 @@ class Workspace:
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario, self._senders = scenario, senders_of(scenario)
-        self._start, (entities, directions) = filters_at_start(scenario), entity_records(scenario)
+        self.filters, (entities, directions) = filters_at_start(scenario), entity_records(scenario)
         # A copy, since directed links count the messages of a run.
         self._records = entities, directions.copy()
         # By receiver and sender: the order in which filters add up messages.
         order = np.lexsort((directions["sender"], directions["receiver"]))
         self._incoming = np.argsort(order, kind="stable")
-        self._waiting = np.zeros(len(self._start.nodes), dtype=np.int64)
-        size, n = self._start.xhat.shape
+        self._waiting = np.zeros(len(self.filters.nodes), dtype=np.int64)
+        size, n = self.filters.xhat.shape
         self._pool = empty_pool(FIRST_MESSAGES)
         self._probes = np.array(scenario.times, dtype=np.float64)
         # Space for many samples, within a budget of floats.
@@ -178,33 +166,28 @@ class Workspace:
         self._kernels = kernels
         self.clocked: ClockFilters | None = None
         if not is_immediate(scenario):
-            self.clocked = ClockFilters(scenario, kernels, self._start, FIRST_MESSAGES)
+            self.clocked = ClockFilters(scenario, kernels, self.filters, FIRST_MESSAGES)
         self._quantiser = self.clocked.quantiser if self.clocked else PayloadQuantiser()
         # The event loop is compiled once for all n: its verbs alone have loops over the states.
         self._unrolled = kernels.unrolled and self.clocked is None
 
-    @property
-    def filters(self) -> Filters:
-        """The filters at time 0."""
-        return self._start
-
     def visits(self, together: int = 1) -> Visits:
         """Return an empty queue of visits, with space for all nodes of ``together`` runs."""
-        capacity = together * len(self._start.nodes)
+        capacity = together * len(self.filters.nodes)
         if self._visits is None or len(self._visits.level) < capacity:
             series, weights = series_of_lanes(self._scenario), self._records[1]["weight"]
             exchange = pair_exchange(self._scenario, self._kernels, weights)
-            self._visits = empty_visits(self._start, weights, capacity, series, exchange)
+            self._visits = empty_visits(self.filters, weights, capacity, series, exchange)
         return self._visits
 
     def _begin_estimates(self, instants: Instants, together: int) -> tuple[FloatArray, FloatArray]:
         if self.clocked is not None:
             self.clocked.begin(instants)
             return self.clocked.estimates
-        nodes, n = self._start.xhat.shape
+        nodes, n = self.filters.xhat.shape
         xhat, root = with_spare((together * nodes, n)), with_spare((together * nodes, n, n))
-        xhat[:] = np.tile(self._start.xhat, (together, 1))
-        root[:] = np.tile(self._start.root, (together, 1, 1))
+        xhat[:] = np.tile(self.filters.xhat, (together, 1))
+        root[:] = np.tile(self.filters.root, (together, 1, 1))
         return xhat, root
 
     def begin(
@@ -213,7 +196,7 @@ class Workspace:
         """Return the state at time 0 of ``together`` runs with the random numbers of ``draws``,
         which write samples into ``buffer`` (None: the workspace's own), and rows if ``traced``.
         """
-        start, instants, window = self._start, draws.instants, draws.window()
+        start, instants, window = self.filters, draws.instants, draws.window()
         changes = np.array(self._scenario.followed_changes)
         entities, directions = self._records
         # Records of links belong to the workspace: the numbers of their messages start again.
@@ -269,7 +252,7 @@ class Workspace:
 
     def _begin_nodes(self, draws: Any) -> Any:
         """Return the records of nodes, with who is down and what clocks show in a run."""
-        nodes = self._start.nodes.copy()
+        nodes = self.filters.nodes.copy()
         nodes["down"] = draws.lives.filters_down
         for place, clock in draws.clocks.items():
             nodes["offset"][place], nodes["pace"][place] = clock.offset, clock.pace
@@ -379,10 +362,14 @@ class FlowRun:
             # Positions are relative to the new block.
             state.piece = state.grid_at = 0
         elif request == WANT_MESSAGES:
-            self._enlarge_pool()
+            add_messages(state, state.most_messages)
+            if self._clocked is not None:
+                self._clocked.grow(len(state.pool))
         elif request == WANT_ROWS:
             self._record_rows(state.row, state.counts)
-            self._enlarge_rows()
+            length = max(recording.BLOCK, 2 * state.most_rows)
+            if len(state.rows) < length:
+                state.rows = np.empty(length, dtype=EVENT)
         elif request == WANT_PAST and self._clocked is not None:
             self._clocked.grow_past()
         elif request == WANT_REBASE:
@@ -425,16 +412,6 @@ class FlowRun:
             self._clocked.restart(h, self._scenario.prior_shift(node, time))
             clock = self._draws.clocks.get(h)
             state.now[h] = time if clock is None else clock.shows(time)
-
-    def _enlarge_pool(self) -> None:
-        add_messages(self._state, self._state.most_messages)
-        if self._clocked is not None:
-            self._clocked.grow(len(self._state.pool))
-
-    def _enlarge_rows(self) -> None:
-        length = max(recording.BLOCK, 2 * self._state.most_rows)
-        if len(self._state.rows) < length:
-            self._state.rows = np.empty(length, dtype=EVENT)
 
     def _record_rows(self, count: int, counts: np.ndarray) -> None:
         state, recorder = self._state, self._recorder

@@ -1,18 +1,17 @@
-"""Gates: which readings they look at, and their events in slots."""
+"""Which readings gates look at, and the events in slots that filters decide: readings that gates
+refuse, and messages of few bits whose numbers are clipped.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
-from netkf.engines.compiled.slot_messages import SENSE, SlotTimes
-from netkf.engines.compiled.slot_setup import slot_setup
-from netkf.engines.compiled.slot_steps import step_times
-from netkf.linalg.arrays import IntArray
-from netkf.linalg.lanes import by_run
+from netkf.engines.compiled.slot_messages import SlotTimes
+from netkf.engines.compiled.slot_setup import SlotSetup, slot_setup
+from netkf.engines.compiled.slot_steps import StepTimes, step_times
+from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.scenario.scenario import Scenario
-from netkf.trace.schema import CODES
-
-REFUSE = CODES["refuse"]
+from netkf.trace.schema import CLIP, REFUSE, SEND, SENSE
 
 
 def ungated_readings(scenario: Scenario) -> str | None:
@@ -31,14 +30,6 @@ def ungated_readings(scenario: Scenario) -> str | None:
     if not scenario.has_linear_sensors and scenario.filter.linearise != "ekf":
         return "nonlinear readings at sigma points"
     return None
-
-
-def count_refusals(refused: np.ndarray, counted: np.ndarray, runs: int) -> IntArray:
-    """Return how often gates refused in each run (R,), in the slots ``counted`` (S,), as
-    ``SlotPlan.refused`` (B, S, G, L) says it.
-    """
-    counts: IntArray = by_run(refused[:, counted].sum(axis=(1, 2), dtype=np.int64), runs)
-    return counts
 
 
 def with_refusals(
@@ -68,6 +59,45 @@ def with_refusals(
     made["node"] = nodes[numbers[known]]
     places = read[last[known] - 1] + 1
     return insert_rows(rows, places, made, before_sample)
+
+
+def with_clips(
+    setup: SlotSetup,
+    times: StepTimes,
+    clipped: np.ndarray,
+    rows: np.ndarray,
+    before_sample: IntArray,
+) -> tuple[np.ndarray, IntArray]:
+    """Return EVENT ``rows`` (K,) of the first run with those of clipped messages, behind the first
+    ``send`` of each, and the number of rows before each sample, of ``before_sample`` (T,).
+    """
+    slots, steps, nodes = np.nonzero(clipped[0, ..., 0])
+    if not len(slots):
+        return rows, before_sample
+    phases, ids = np.array(setup.phases, dtype=np.int64), np.sort(setup.nodes)
+    now = times.begin[slots, steps]
+    moments = np.unique(now)
+
+    def transmission(t: FloatArray, phase: IntArray, node: IntArray) -> IntArray:
+        """Return a number that only the messages of one transmission share."""
+        moment = np.searchsorted(moments, t) * (int(phases.max()) + 1) + phase
+        return np.asarray(moment * len(ids) + np.searchsorted(ids, node))
+
+    sends = np.flatnonzero((rows["kind"] == SEND) & np.isin(rows["t"], moments))
+    known, first = np.unique(
+        transmission(*(rows[name][sends] for name in ("t", "phase", "node"))), return_index=True
+    )
+    sought = transmission(now, phases[steps], setup.nodes[nodes])
+    # Slots of other rows have none.
+    there = np.isin(sought, known)
+    made = np.zeros(int(there.sum()), dtype=rows.dtype)
+    slots, steps, nodes = slots[there], steps[there], nodes[there]
+    made["t"], made["phase"], made["node"] = now[there], phases[steps], setup.nodes[nodes]
+    made["kind"], made["peer"], made["age"] = CLIP, -1, np.nan
+    made["message"] = clipped[0, slots, steps, nodes, 0]
+    places = sends[first[np.searchsorted(known, sought[there])]] + 1
+    order = np.argsort(places)
+    return insert_rows(rows, places[order], made[order], before_sample)
 
 
 def insert_rows(

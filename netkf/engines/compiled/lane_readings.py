@@ -94,9 +94,7 @@ def empty_readings(filters: Filters) -> LaneReadings:
         name: np.full(LANES, -1, dtype=np.int64) for name in ("model", "kind", "noise_row")
     }
     return LaneReadings(
-        **{name: with_spare(shape) for name, shape in shapes.items()},
-        **unknown,
-        alone=int(several),
+        **{name: with_spare(shape) for name, shape in shapes.items()}, **unknown, alone=int(several)
     )
 
 

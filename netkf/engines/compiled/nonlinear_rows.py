@@ -18,12 +18,7 @@ from netkf.algorithms.kernels.nonlinear_rows import (
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.vector_functions import VectorFunction
-from netkf.plants.nonlinear import (
-    NonlinearSensor,
-    PositionedSensor,
-    jacobian_of,
-    reading_of,
-)
+from netkf.plants.nonlinear import NonlinearSensor, PositionedSensor, jacobian_of, reading_of
 from netkf.plants.relative import RelativePositionSensor
 
 

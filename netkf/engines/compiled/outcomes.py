@@ -248,7 +248,7 @@ def list_outcomes(
                 # Directions that share a stream share its draws.
                 if senders.source[w] != last:
                     last = int(senders.source[w])
-                    draws = _sampler(channel, one, senders.sources[last]).draws(len(times))
+                    draws = sampler_of(channel, one, senders.sources[last]).draws(len(times))
                 first, heard = scenario.transmission(senders.directions[w]), slice(None)
                 (uniform, bad, delay), common = draws, shared.get((e, first.link[0]))
                 if common is not None:
@@ -329,7 +329,8 @@ def _waits(
     return found
 
 
-def _sampler(channel: Channel, streams: Streams, ends: Link) -> ChannelSampler:
+def sampler_of(channel: Channel, streams: Streams, ends: Link) -> ChannelSampler:
+    """Return what draws the outcomes of the messages between two ``ends`` of one run."""
     return ChannelSampler(channel, ends, lambda purpose: streams.generator(purpose, *ends))
 
 

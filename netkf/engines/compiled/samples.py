@@ -12,9 +12,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.run import StateSamples
-from netkf.trace.schema import CODES
-
-DIVERGED = CODES["diverged"]
+from netkf.trace.schema import DIVERGED
 
 
 def entries_of(scenario: Scenario) -> np.ndarray:

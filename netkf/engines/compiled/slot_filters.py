@@ -13,12 +13,7 @@ from netkf.algorithms.kernels.at_rest import run_at_rest
 from netkf.algorithms.kernels.gates import gate_tables, own_sizes
 from netkf.algorithms.kernels.maps import MapRun
 from netkf.algorithms.kernels.pairs import Pairs, no_pairs
-from netkf.algorithms.kernels.run import (
-    Estimates,
-    SlotModelArrays,
-    SlotRun,
-    size_of,
-)
+from netkf.algorithms.kernels.run import Estimates, SlotModelArrays, SlotRun, size_of
 from netkf.algorithms.models import MapModel, changing_models
 from netkf.algorithms.records import Kernels, make_records
 from netkf.engines.compiled.quantiser import PayloadQuantiser

@@ -20,13 +20,9 @@ from netkf.linalg.lanes import Lanes, load_flags, select, spread, store
 from netkf.network.matchings import PROTOCOLS
 from netkf.rng.draws import next_unit
 from netkf.rng.numbers import next_integer, shuffle
-from netkf.trace.schema import CODES
+from netkf.trace.schema import ABSORB, DELIVER, LOST, ROUND, SEND, SENSE, STOP, SWAP, TICK
 
 ONE_EDGE, NODE_WAKEUP, MAXIMAL, UNIFORM_MAXIMAL, INDEPENDENT = range(len(PROTOCOLS))
-SENSE, TICK, SEND, DELIVER, LOST, ABSORB, SWAP, ROUND, STOP = (
-    CODES[kind]
-    for kind in ("sense", "tick", "send", "deliver", "lost", "absorb", "swap", "round", "stop")
-)
 NAN = np.nan
 
 
@@ -119,10 +115,7 @@ def _free_links(matchings: Matchings, ends: np.ndarray, r: int, active: np.ndarr
             # A full matching has no entry behind it, hence the minimum.
             index = min(pairs, len(active) - 1)
             active[index] += free * (order[k] - active[index])
-            busy[i], busy[j] = (
-                busy[i] | free,
-                busy[j] | free,
-            )
+            busy[i], busy[j] = (busy[i] | free, busy[j] | free)
             pairs += free
         return pairs
     # INDEPENDENT: ``order`` is 1 for links that are drawn, ``busy`` counts those at each node.

@@ -21,24 +21,14 @@ from netkf.algorithms.kernels.nonlinear_rows import NonlinearRows, add_values
 from netkf.algorithms.kernels.pairs import Pairs
 from netkf.core.memory import ReusableMemory, keep_freed_memory
 from netkf.engines.base import Progress
-from netkf.engines.compiled.gates import REFUSE, count_refusals, with_refusals
+from netkf.engines.compiled.gates import with_clips, with_refusals
 from netkf.engines.compiled.outcomes import channel_streams, demand_probabilities
 from netkf.engines.compiled.own_sensors import read_whitened
 from netkf.engines.compiled.quantiser import dither_of
 from netkf.engines.compiled.samples import by_node, record_samples
-from netkf.engines.compiled.slot_clips import CLIP, count_clips, with_clips
 from netkf.engines.compiled.slot_filters import SlotFilters
 from netkf.engines.compiled.slot_loop import WHOLE, SlotSamples
 from netkf.engines.compiled.slot_messages import (
-    ABSORB,
-    DELIVER,
-    LOST,
-    ROUND,
-    SEND,
-    SENSE,
-    STOP,
-    SWAP,
-    TICK,
     EventRows,
     SlotChannels,
     SlotMessages,
@@ -78,7 +68,21 @@ from netkf.scenario.scenario import Scenario
 from netkf.trace.batch import COMPLETE, DIVERGED, RunBatch
 from netkf.trace.recorder import LONG, Recorder
 from netkf.trace.run import StateSamples
-from netkf.trace.schema import EVENT, KINDS
+from netkf.trace.schema import (
+    ABSORB,
+    CLIP,
+    DELIVER,
+    EVENT,
+    KINDS,
+    LOST,
+    REFUSE,
+    ROUND,
+    SEND,
+    SENSE,
+    STOP,
+    SWAP,
+    TICK,
+)
 
 CACHED = 1 << 18  # bytes of the processor's cache for arrival bits
 NEVER, _ALL = np.iinfo(np.int64).max, np.zeros((0, 0), dtype=np.int64)
@@ -308,7 +312,9 @@ class SlotRuns:
         }
         # Nodes begin again before the first slot of a block.
         for h in self._tables[0].restarts.get(self._slot, ()) if self._tables else ():
-            filters.restart(h, self._moved(h))
+            # By how much its prior differs in the coordinates of this slot.
+            start = self._slot - (not self.setup.algorithm.timing.predicts)
+            filters.restart(h, self._scenario.prior_shift(self.setup.infos[h].node, start))
 
         def decided(step: int, up: np.ndarray) -> np.ndarray:
             nonlocal begin
@@ -344,11 +350,6 @@ class SlotRuns:
             mark_senders(self._channels, messages, times.exchanged, self.runs, speaks)
             speaks[:, unread] = 0
         return speaks
-
-    def _moved(self, h: int) -> FloatArray:
-        """Return by how much the prior of a filter differs in the coordinates of this slot."""
-        slot = self._slot - (not self.setup.algorithm.timing.predicts)
-        return self._scenario.prior_shift(self.setup.infos[h].node, slot)
 
     def _next_messages(self, max_events: int, timed: bool) -> tuple[SlotTimes, SlotMessages]:
         setup, tables = self.setup, self._tables
@@ -817,10 +818,11 @@ class SlotRuns:
             counts[r] += tables.take_counts()
         if not self._tables:
             self._count_drawn(block)
-        refused = times.recorded & times.sensed
-        counts[:, REFUSE] += count_refusals(block.refused, refused, self.runs)
+        refused = block.refused[:, times.recorded & times.sensed]
+        counts[:, REFUSE] += by_run(refused.sum(axis=(1, 2), dtype=np.int64), self.runs)
         if block.clipped.size:
-            counts[:, CLIP] += count_clips(block.clipped, times.recorded, self.runs)
+            clipped = block.clipped[:, times.recorded] > 0
+            counts[:, CLIP] += by_run(clipped.sum(axis=(1, 2, 3), dtype=np.int64), self.runs)
         if setup.stages.stopping >= 0:
             since = by_run(self._stopped, self.runs) - times.first
             counts[:, STOP] += ((since >= 0) & (since < times.recorded.sum())).sum(axis=1)

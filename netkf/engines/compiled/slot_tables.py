@@ -9,19 +9,35 @@ the filters' kernel decides step by step who sends.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from functools import partial
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from netkf.engines.compiled.drawn_ahead import DrawnAhead, numbers_of
 from netkf.engines.compiled.life_tables import life_table
-from netkf.engines.compiled.outcomes import delivery_table, message_delays
+from netkf.engines.compiled.outcomes import delivery_table, message_delays, sampler_of
 from netkf.engines.compiled.per_scenario import once_per_scenario
-from netkf.engines.compiled.slot_messages import (
+from netkf.engines.compiled.slot_messages import Matchings, draw_pairs
+from netkf.engines.compiled.slot_setup import SlotSetup, slot_setup
+from netkf.engines.compiled.slot_steps import StepTimes, slot_restarts
+from netkf.engines.reach import Reach
+from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.network.channels import broadcasts_of, conditions_of
+from netkf.network.delays import delay_depends_on_message
+from netkf.network.losses import GilbertElliott, Transmission, identical_per_link
+from netkf.network.matchings import Broadcast, Matching, used_links
+from netkf.network.radio import Airtime
+from netkf.rng.streams import Streams
+from netkf.scenario.scenario import Scenario
+from netkf.trace.recorder import NAN
+from netkf.trace.schema import (
     ABSORB,
     DELIVER,
+    EVENT,
+    KINDS,
+    LATE,
+    LINK,
     LOST,
     ROUND,
     SEND,
@@ -29,25 +45,8 @@ from netkf.engines.compiled.slot_messages import (
     STOP,
     SWAP,
     TICK,
-    Matchings,
-    draw_pairs,
 )
-from netkf.engines.compiled.slot_setup import SlotSetup, slot_setup
-from netkf.engines.compiled.slot_steps import StepTimes, slot_restarts
-from netkf.engines.reach import Reach
-from netkf.linalg.arrays import FloatArray, IntArray
-from netkf.network.channels import ChannelSampler, broadcasts_of, conditions_of
-from netkf.network.delays import delay_depends_on_message
-from netkf.network.graphs import Link
-from netkf.network.losses import GilbertElliott, Transmission, identical_per_link
-from netkf.network.matchings import Broadcast, Matching, used_links
-from netkf.network.radio import Airtime
-from netkf.rng.streams import Streams
-from netkf.scenario.scenario import Scenario
-from netkf.trace.recorder import NAN
-from netkf.trace.schema import CODES, EVENT, KINDS
 
-LATE, LINK = CODES["late"], CODES["link"]
 COLUMNS = ("t", "kind", "node", "peer", "message", "phase", "age")
 Decide = Callable[[int, np.ndarray], np.ndarray]
 AHEAD = 256
@@ -98,10 +97,6 @@ class Uses(NamedTuple):
     bad: FloatArray
     delay: FloatArray
 
-    def of(self, chosen: np.ndarray) -> Uses:
-        """Return the chosen ones of these."""
-        return self if chosen.all() else Uses(*(column[chosen] for column in self))
-
 
 class Messages(NamedTuple):
     """K messages, (K,) each.
@@ -125,9 +120,16 @@ class Messages(NamedTuple):
     outcome: IntArray
     absorbed: np.ndarray
 
-    def of(self, chosen: np.ndarray) -> Messages:
-        """Return the chosen ones of these."""
-        return self if chosen.all() else Messages(*(column[chosen] for column in self))
+
+Rows = TypeVar("Rows", UnorderedRows, Uses, Messages)
+
+
+def _chosen(rows: Rows, chosen: np.ndarray) -> Rows:
+    """Return the ``chosen`` (K,) ones of K rows."""
+    if chosen.all():
+        return rows
+    columns: Iterable[Any] = rows
+    return type(rows)(*(c[chosen] if isinstance(c, np.ndarray) else c for c in columns))
 
 
 NO_MESSAGES = Messages(*(np.zeros(0, dtype=np.int64),) * 5, *(np.zeros(0),) * 3,
@@ -164,11 +166,7 @@ class SlotTables:
         self._part = 0
         self._reach: Reach | None = None
         if scenario.links_move:
-            self._reach = Reach(
-                scenario,
-                scenario.slot_truth(streams),
-                self._append_link,
-            )
+            self._reach = Reach(scenario, scenario.slot_truth(streams), self._append_link)
         self._begin_pairs(streams)
         self._begin_channel(streams)
         self._sent_so_far = np.zeros(len(setup.directions), dtype=np.int64)
@@ -199,18 +197,10 @@ class SlotTables:
         self._radio = scenario.network.radio
         self._airtime = Airtime(scenario, streams) if self._radio else None
         self._follows = self._reach is not None and channel.loss.follows_distance
-        senders = setup.senders
-        samplers = [
-            ChannelSampler(channel, ends, partial(_stream, streams, ends))
-            for ends in senders.sources
-        ]
+        samplers = [sampler_of(channel, streams, ends) for ends in setup.senders.sources]
         ahead = AHEAD if setup.decides else 0
-
-        def of_links(k: int, count: int) -> Sequence[FloatArray]:
-            return samplers[k].draws(count)
-
         # Links that hold their draws have the last one, of all that they made.
-        self._draws = DrawnAhead(of_links, 3, len(samplers), ahead)
+        self._draws = DrawnAhead(lambda k, count: samplers[k].draws(count), 3, len(samplers), ahead)
         self._drawn = np.zeros(len(setup.ends), dtype=np.int64)
         self._shared: DrawnAhead | None = None
         if (broadcasts := broadcasts_of(scenario, streams)) is not None:
@@ -248,13 +238,13 @@ class SlotTables:
         up = np.zeros((len(times.start), len(setup.fresh), len(setup.directions)), dtype=np.uint8)
         sends = self._who_sends(times, uses)
         if decide is None:
-            messages = self._send(times, uses.of(sends), up)
+            messages = self._send(times, _chosen(uses, sends), up)
         else:
             parts = [NO_MESSAGES]
             for step in range(len(setup.fresh) if times.exchanged[0] else 0):
                 sent = decide(step, up[0])
                 chosen = sends & (uses.step == step) & (sent[self._sender[uses.w]] != 0)
-                parts.append(self._send(times, uses.of(chosen), up))
+                parts.append(self._send(times, _chosen(uses, chosen), up))
             messages = Messages(*map(np.concatenate, zip(*parts, strict=True)))
         self._starts = self._rows_of_steps(times, uses)
         self._uses, self._times, self._messages = None, times, messages
@@ -493,7 +483,7 @@ class SlotTables:
 
     def _rows_of(self, times: StepTimes, messages: Messages) -> list[UnorderedRows]:
         """Return the rows of the messages of a block, and of what happens meanwhile."""
-        kept = messages.of(times.recorded[messages.slot])
+        kept = _chosen(messages, times.recorded[messages.slot])
         part, sender, receiver = self._part_of(kept.slot, kept.step), *self._ends_of(kept)
         # Rows of a message in the order of the pairs, forth before back.
         order = 3 * (kept.w % self._setup.directions_per_link)
@@ -503,7 +493,7 @@ class SlotTables:
         )  # fmt: skip
         ended = ~(kept.arrival > kept.sent)
         at_once = self._rows_of_outcomes(
-            kept.of(ended), part[ended], 2, kept.place[ended], order[ended] + 1
+            _chosen(kept, ended), part[ended], 2, kept.place[ended], order[ended] + 1
         )
         links = [
             UnorderedRows(np.array([part]), t, kind, i, j, is_up, place=k)
@@ -546,7 +536,7 @@ class SlotTables:
             part, t = self._part_of(slot, step), times.begin[slot, step]
             rows.append(UnorderedRows(part, t, ROUND, -1, phase=self._phase[step], group=1))
             return rows
-        used = uses.of(times.recorded[uses.slot] & (uses.w % setup.directions_per_link == 0))
+        used = _chosen(uses, times.recorded[uses.slot] & (uses.w % setup.directions_per_link == 0))
         t, ends = times.begin[used.slot, used.step], (self._sender[used.w], self._receiver[used.w])
         i, j = (self._ids[end] for end in ends)
         part, phase = self._part_of(used.slot, used.step), self._phase[used.step]
@@ -560,7 +550,7 @@ class SlotTables:
     def _rows_of_ends(self, kept: Messages, part: IntArray) -> UnorderedRows:
         """Return the rows with which steps end, given the messages of those that are recorded."""
         used = kept.absorbed
-        here, part = kept.of(used), part[used]
+        here, part = _chosen(kept, used), part[used]
         node, age = self._receiver[here.w], self._grid.snap(here.arrival - here.sent)
         if self._timing.pairwise:
             peer = self._ids[self._sender[here.w]]
@@ -582,11 +572,11 @@ class SlotTables:
     ) -> tuple[UnorderedRows, UnorderedRows]:
         """Return rows of slow messages and of lives until the block ends; keep later ones."""
         until, part = self._ends_of_parts(times)
-        new = messages.of((messages.arrival > messages.sent) & (messages.outcome >= 0))
+        new = _chosen(messages, (messages.arrival > messages.sent) & (messages.outcome >= 0))
         under_way = Messages(*map(np.concatenate, zip(self._under_way, new, strict=True)))
         at = np.searchsorted(until, under_way.arrival)
-        self._under_way = under_way.of(at == len(until))
-        here, part_of = under_way.of(at < len(until)), part[at[at < len(until)]]
+        self._under_way = _chosen(under_way, at == len(until))
+        here, part_of = _chosen(under_way, at < len(until)), part[at[at < len(until)]]
         ended = self._rows_of_outcomes(here, part_of, 1, here.w, here.number)
         lives, first = self.lives, self._lives_passed
         self._lives_passed = int(np.searchsorted(lives.t[: self._changes], until[-1], "right"))
@@ -622,7 +612,7 @@ class SlotTables:
         groups = [*self._starts, *self._rows_of(self._times, self._messages)]
         if self._setup.stages.stopping >= 0:
             groups = [*groups, self._stops(stopped - self._times.first, self._times)]
-        columns = [_whole(rows) for rows in groups]
+        columns = [[np.broadcast_to(c, len(rows.part)) for c in rows] for rows in groups]
         part, t, *of_event, group, place, number = map(np.concatenate, zip(*columns, strict=True))
         order = np.lexsort((number, place, group, t, part))
         table = np.empty(len(order), dtype=EVENT)
@@ -657,16 +647,3 @@ def _first_messages(scenario: Scenario) -> tuple[list[Transmission], FloatArray 
     if not one_law or moves or channel.channels or delay_depends_on_message(channel.delay):
         return first, None
     return first, delivery_table(scenario, channel.loss, directions)
-
-
-def _chosen(rows: UnorderedRows, chosen: np.ndarray) -> UnorderedRows:
-    columns = (c[chosen] if isinstance(c, np.ndarray) else c for c in rows)
-    return UnorderedRows(*columns)
-
-
-def _whole(rows: UnorderedRows) -> list[np.ndarray]:
-    return [np.broadcast_to(column, len(rows.part)) for column in rows]
-
-
-def _stream(streams: Streams, ends: Link, purpose: str) -> np.random.Generator:
-    return streams.generator(purpose, *ends)

@@ -13,12 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.kernels.gains import Gains, stack_gains
-from netkf.algorithms.kernels.root_flow import (
-    FlowScratch,
-    FlowTable,
-    flow_scratch,
-    stack_tables,
-)
+from netkf.algorithms.kernels.root_flow import FlowScratch, FlowTable, flow_scratch, stack_tables
 from netkf.algorithms.models import FlowModel, RateModel, first_roots
 from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.quantiser import Quantiser

@@ -342,28 +342,27 @@ def ticks_apart(clock: object) -> bool:
     return type(clock) is Poisson
 
 
-def _is_listed(scenario: Scenario) -> bool:
-    """Return True if Python lists the ticks, as of a user's clock or of nodes that move."""
-    network = scenario.network
-    return (
-        scenario.links_move
-        or bool(network.clocks)
-        or not (is_kernel_clock(network.activation) and draws_in_kernels(network))
-    )
-
-
 def _list_ticks(
     scenario: Scenario,
     streams: Streams | ReplicaStreams,
     senders: Senders,
     instants: Instants | None,
-) -> list[FloatArray]:
-    """Return the instants (K,) of all ticks of each entity of each run (R E), in seconds."""
-    clock = scenario.network.activation
+    lives: LifeTable,
+) -> list[FloatArray] | None:
+    """Return the instants (K,) of all ticks of each entity of each run (R E), in seconds; None
+    where kernels draw them.
+    """
+    network = scenario.network
     if senders.at == "readings":
         assert instants is not None
-        return [instants.t[instants.index == node] for node in range(len(senders.entities))]
-    if not isinstance(clock, LinkClock):
+        listed = [instants.t[instants.index == node] for node in range(len(senders.entities))]
+        # Who is down takes no sample, after which to transmit.
+        return [t[~lives.is_down(h, t)] for h, t in enumerate(listed)]
+    # Python lists the ticks of a user's clock, and of nodes that move.
+    in_kernels = is_kernel_clock(network.activation) and draws_in_kernels(network)
+    if senders.entities and in_kernels and not (scenario.links_move or network.clocks):
+        return None
+    if not isinstance(network.activation, LinkClock):
         return []
     # A tick that rounding brings to the horizon is none: whatever counts ticks counts these.
     return [
@@ -474,23 +473,6 @@ def _law_of_messages(scenario: Scenario) -> tuple[FloatArray, list[Transmission]
     return delivery_table(scenario, loss, directions), []
 
 
-def _listed_ticks(
-    scenario: Scenario,
-    streams: Streams | ReplicaStreams,
-    senders: Senders,
-    instants: Instants | None,
-    lives: LifeTable,
-) -> list[FloatArray] | None:
-    """Return the ticks of each entity of each run, None where kernels draw them."""
-    if senders.entities and senders.at != "readings" and not _is_listed(scenario):
-        return None
-    listed = _list_ticks(scenario, streams, senders, instants)
-    if senders.at != "readings":
-        return listed
-    # Who is down takes no sample, after which to transmit.
-    return [t[~lives.is_down(h, t)] for h, t in enumerate(listed)]
-
-
 class Schedule:
     """The ticks of some runs of a scenario, and which of their messages arrive: window by window,
     or all at once. ``bits``: the outcomes of a tick are one integer with a bit for each of its
@@ -510,7 +492,7 @@ class Schedule:
     ) -> None:
         senders, channel = senders_of(scenario), scenario.network.channel
         self._runs, sizes = streams.runs, np.diff(senders.first)
-        listed = _listed_ticks(scenario, streams, senders, instants, lives)
+        listed = _list_ticks(scenario, streams, senders, instants, lives)
         if listed is None:
             rates = _rates(scenario)
         else:
@@ -564,42 +546,6 @@ class Schedule:
         if not begin < end < self._horizon:
             end = math.inf
         self._end = end
-        return self._window(0, begin, end)
-
-    def all(self) -> AllTicks:
-        """Return all ticks of all R runs up to the horizon, one run after the other."""
-        clocks, channels = self._clocks, self._channels
-        states: list[np.ndarray] = [clocks.next_tick, clocks.number, clocks.streams]
-        states += [channels.loss, channels.state, channels.delay, channels.bad, channels.following]
-        states += [channels.delivery_laws.sent]
-        # Copies of the streams: an attempt that runs out of space starts again from them.
-        copies = [state.copy() for state in states]
-        # Space for the mean plus eight standard deviations of a Poisson count; in the rare case of
-        # more ticks the loop tries again with more space.
-        expected, spread = self._rate * self._horizon, 8.0
-        while True:
-            max_ticks = _space_for_count(expected, spread)
-            total = _space_for_count(self._runs * expected, spread) + max_ticks
-            buffer, ticks = self._space(max_ticks), self._space_for_all(total)
-            scratch = buffer, np.zeros(2, dtype=np.int64), _sorting(max_ticks)
-            if draw_all_ticks(clocks, channels, self._horizon, *scratch, ticks):
-                self._demand()
-                return ticks
-            spread *= 2.0
-            for state, copy in zip(states, copies, strict=True):
-                state[:] = copy
-
-    def _space(self, ticks: int) -> TickBuffer:
-        sends = 0.0 if self._channels.bits else self._sends
-        return _empty_buffer(ticks, int(sends * ticks) + self._max_sends)
-
-    def _space_for_all(self, ticks: int) -> AllTicks:
-        t, entity, first_outcome, delay = self._space(ticks)
-        first, first_delay = (np.zeros(self._runs + 1, dtype=np.int64) for _ in range(2))
-        return AllTicks(t, entity, first_outcome, delay, first, first_delay, self._channels.bits)
-
-    def _window(self, run: int, begin: float, end: float) -> TickArrays:
-        """Draw and return the ticks of run number ``run`` in [begin, end) seconds, in order."""
         last, counts = min(end, self._horizon), np.zeros(2, dtype=np.int64)
         # Space for the mean plus eight standard deviations of a Poisson count is nearly always
         # enough.
@@ -608,7 +554,7 @@ class Schedule:
         sends = int(self._sends * ticks) + self._max_sends
         while True:
             self._enlarge_buffer(ticks, sends)
-            if draw_ticks(self._clocks, self._channels, run, last, self._buffer, counts):
+            if draw_ticks(self._clocks, self._channels, 0, last, self._buffer, counts):
                 break
             # The ticks so far stay in the buffer: the kernel continues where it stopped.
             ticks, sends = 2 * ticks, 2 * sends
@@ -627,6 +573,35 @@ class Schedule:
             owner=moving.owner,
             link=moving.link,
         )
+
+    def all(self) -> AllTicks:
+        """Return all ticks of all R runs up to the horizon, one run after the other."""
+        clocks, channels = self._clocks, self._channels
+        states: list[np.ndarray] = [clocks.next_tick, clocks.number, clocks.streams]
+        states += [channels.loss, channels.state, channels.delay, channels.bad, channels.following]
+        states += [channels.delivery_laws.sent]
+        # Copies of the streams: an attempt that runs out of space starts again from them.
+        copies = [state.copy() for state in states]
+        # Space for the mean plus eight standard deviations of a Poisson count; in the rare case of
+        # more ticks the loop tries again with more space.
+        expected, spread = self._rate * self._horizon, 8.0
+        while True:
+            max_ticks = _space_for_count(expected, spread)
+            total = _space_for_count(self._runs * expected, spread) + max_ticks
+            first, first_delay = (np.zeros(self._runs + 1, dtype=np.int64) for _ in range(2))
+            buffer = self._space(max_ticks)
+            ticks = AllTicks(*self._space(total), first, first_delay, self._channels.bits)
+            scratch = buffer, np.zeros(2, dtype=np.int64), _sorting(max_ticks)
+            if draw_all_ticks(clocks, channels, self._horizon, *scratch, ticks):
+                self._demand()
+                return ticks
+            spread *= 2.0
+            for state, copy in zip(states, copies, strict=True):
+                state[:] = copy
+
+    def _space(self, ticks: int) -> TickBuffer:
+        sends = 0.0 if self._channels.bits else self._sends
+        return _empty_buffer(ticks, int(sends * ticks) + self._max_sends)
 
     def _enlarge_buffer(self, ticks: int, sends: int) -> None:
         if len(self._buffer.t) >= ticks and len(self._buffer.delay) >= sends:

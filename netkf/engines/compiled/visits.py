@@ -39,26 +39,12 @@ from netkf.engines.compiled.lane_readings import (
     load_model,
     read_alone,
 )
-from netkf.engines.compiled.lane_series import (
-    NEAR,
-    LaneSeries,
-    max_moments,
-)
+from netkf.engines.compiled.lane_series import NEAR, LaneSeries, max_moments
 from netkf.engines.compiled.pair_exchange import PairExchange, receive, send_both
 from netkf.engines.compiled.state import Filters, Simulation
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import (
-    LANES,
-    MANY,
-    gather,
-    load,
-    prefetch,
-    scatter,
-    store,
-    turn,
-    with_spare,
-)
+from netkf.linalg.lanes import LANES, MANY, gather, load, prefetch, scatter, store, turn, with_spare
 from netkf.linalg.local import local_lanes_matrix, local_lanes_vector
 from netkf.linalg.series import fill_row
 from netkf.linalg.structs import Struct

@@ -19,9 +19,8 @@ from netkf.network.node_clocks import node_time, owner_of
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
-from netkf.trace.schema import CODES
+from netkf.trace.schema import TICK, TRANSMIT
 
-TICK, TRANSMIT = CODES["tick"], CODES["transmit"]
 FIRST_BLOCK, MAX_BLOCK = 8, 1024  # ticks of a clock that are drawn at once: at first, and at most
 
 Process = Generator[simpy.Event, Any, None]
@@ -102,10 +101,7 @@ Activations = list[tuple[tuple[int, ...], Activation]]
 
 
 def _link_activations(
-    scenario: Scenario,
-    recorder: Recorder,
-    transmitter: Transmitter,
-    nodes: dict[int, ClockedNode],
+    scenario: Scenario, recorder: Recorder, transmitter: Transmitter, nodes: dict[int, ClockedNode]
 ) -> Activations:
     """Return for each link what happens at a tick: both ends exchange."""
 
@@ -132,10 +128,7 @@ def _link_activations(
 
 
 def _direction_activations(
-    scenario: Scenario,
-    recorder: Recorder,
-    transmitter: Transmitter,
-    nodes: dict[int, ClockedNode],
+    scenario: Scenario, recorder: Recorder, transmitter: Transmitter, nodes: dict[int, ClockedNode]
 ) -> Activations:
     """Return for each direction what happens at a tick: the sender sends."""
 
@@ -165,10 +158,7 @@ def _directed_links(
 
 
 def broadcasts(
-    scenario: Scenario,
-    recorder: Recorder,
-    transmitter: Transmitter,
-    nodes: dict[int, ClockedNode],
+    scenario: Scenario, recorder: Recorder, transmitter: Transmitter, nodes: dict[int, ClockedNode]
 ) -> dict[int, Activation]:
     """Return for each node, by id, a function of the time that broadcasts one payload to all its
     receivers, to each with an outcome of its own.
@@ -201,10 +191,7 @@ def broadcasts(
 
 
 def _node_activations(
-    scenario: Scenario,
-    recorder: Recorder,
-    transmitter: Transmitter,
-    nodes: dict[int, ClockedNode],
+    scenario: Scenario, recorder: Recorder, transmitter: Transmitter, nodes: dict[int, ClockedNode]
 ) -> Activations:
     """Return for each node, as (id,), what happens at a tick: it broadcasts."""
     transmit = broadcasts(scenario, recorder, transmitter, nodes)

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import simpy
 
-from netkf.algorithms.filter import Filter
 from netkf.algorithms.kernels.maps import spread_of
 from netkf.algorithms.models import MapModel, RateModel
 from netkf.engines.base import Engine, Progress, Rank, broken
@@ -21,13 +20,7 @@ from netkf.engines.simpy.driven import DrivenModel
 from netkf.engines.simpy.membership import Membership
 from netkf.engines.simpy.nodes import ClockedNode, Node, View, distinct
 from netkf.engines.simpy.sensors import increment_sensors, sensor_processes
-from netkf.engines.simpy.slots import (
-    FIRST_RANK,
-    Reader,
-    SlotClock,
-    SlotNode,
-    SlotSchedule,
-)
+from netkf.engines.simpy.slots import FIRST_RANK, Reader, SlotClock, SlotNode, SlotSchedule
 from netkf.engines.simpy.timeline import Timeline
 from netkf.engines.simpy.transmission import Transmitter
 from netkf.engines.soundness import sound_mask, stack_estimates
@@ -37,9 +30,8 @@ from netkf.network.node_clocks import node_time
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
-from netkf.trace.schema import CODES
+from netkf.trace.schema import DIVERGED
 
-DIVERGED = CODES["diverged"]
 Process = Generator[simpy.Event, Any, None]
 
 
@@ -368,16 +360,14 @@ class _Sums:
         self.start = self._compute()
 
     def _compute(self) -> dict[str, float]:
-        parts = [_conserved_terms(node.algorithm, node.state) for node in self._nodes]
+        parts = [node.algorithm.analysis.conserved(node.state) for node in self._nodes]
         # fsum: rounding of this sum would look like a loss.
-        return {name: math.fsum(t for part in parts for t in part[name]) for name in parts[0]}
+        return {
+            name: math.fsum(np.concatenate([np.atleast_1d(part[name]) for part in parts]))
+            for name in parts[0]
+        }
 
     def pairs(self) -> dict[str, tuple[float, float]]:
         """Return the sums (at the start, now) by name."""
         now = self._compute()
         return {name: (first, now[name]) for name, first in self.start.items()}
-
-
-def _conserved_terms(algorithm: Filter, state: Any) -> dict[str, list[float]]:
-    quantities = algorithm.analysis.conserved(state)
-    return {name: np.atleast_1d(np.asarray(value)).tolist() for name, value in quantities.items()}

@@ -37,9 +37,8 @@ from netkf.plants.nonlinear import linearise_by_points
 from netkf.plants.readings import Stacked
 from netkf.plants.response import Response, moments_over
 from netkf.trace.recorder import NAN, Recorder
-from netkf.trace.schema import CODES
+from netkf.trace.schema import ABSORB, REFUSE, SENSE
 
-SENSE, ABSORB, REFUSE = CODES["sense"], CODES["absorb"], CODES["refuse"]
 Sample = tuple[FloatArray, Any, FloatArray]
 """A sample y (p,), its H (p, n), or a function that linearises it, and R (p, p)."""
 

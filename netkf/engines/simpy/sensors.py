@@ -19,9 +19,8 @@ from netkf.rng.streams import Streams
 from netkf.scenario.model import PlacedSensor
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
-from netkf.trace.schema import CODES
+from netkf.trace.schema import SENSE
 
-SENSE = CODES["sense"]
 Process = Generator[simpy.Event, Any, None]
 
 

@@ -27,11 +27,8 @@ from netkf.plants.readings import readings_of
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
-from netkf.trace.schema import CODES
+from netkf.trace.schema import ABSORB, ROUND, SENSE, STOP, SWAP, TICK
 
-SENSE, TICK, ROUND, SWAP, ABSORB, STOP = (
-    CODES[kind] for kind in ("sense", "tick", "round", "swap", "absorb", "stop")
-)
 FIRST_RANK = Rank.PROBE + 1
 """The stages of a slot come after arrivals of the same instant; their ranks follow the schedule."""
 

@@ -33,11 +33,7 @@ from netkf.network.radio import Airtime
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
-from netkf.trace.schema import CODES
-
-SEND, DELIVER, LOST, LATE, CLIP = (
-    CODES[kind] for kind in ("send", "deliver", "lost", "late", "clip")
-)
+from netkf.trace.schema import CLIP, DELIVER, LATE, LOST, SEND
 
 LINK_DOWN = ChannelDraw(math.inf, False, 0.0)
 """The draw for a link that is down: no uniform number is below a delivery probability."""

@@ -10,7 +10,7 @@ from netkf.core.instants import MAX_GIVEN_TICKS
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
-from netkf.trace.schema import CODES, rows_of
+from netkf.trace.schema import ROUND, SEND, rows_of
 
 Step = tuple[int, int, int]
 """A slot, an exchange in it (phase) and a step of that."""
@@ -28,9 +28,9 @@ def arrivals_in_slots(
     for slot, kind, node, peer, number, phase, t, age in zip(
         *(column.tolist() for column in columns), strict=True
     ):
-        if kind == CODES["round"]:
+        if kind == ROUND:
             steps[slot, phase] = steps.get((slot, phase), -1) + 1
-        elif kind == CODES["send"]:
+        elif kind == SEND:
             sent[node, peer, number] = slot, phase, steps.get((slot, phase), 0)
         else:
             yield sent.pop((peer, node, number)), peer, node, t, age

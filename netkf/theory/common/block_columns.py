@@ -28,7 +28,7 @@ from netkf.theory.common.kernel_columns import KernelColumns
 from netkf.theory.common.observations import Observation, slot_observations, timed_observations
 from netkf.trace.nees import without_padding
 from netkf.trace.run import Run
-from netkf.trace.schema import CODES
+from netkf.trace.schema import ABSORB, DELIVER, LATE, LOST, SEND, SENSE, TRANSMIT
 
 SPARE = 1024
 """Columns beyond twice the number of states: more than any matrix of a filter has, so that an array
@@ -251,7 +251,7 @@ class ClockBlocks(BlockColumns, LoggedColumns):
         self._log = list(zip(*(run.log[name].tolist() for name in names), strict=True))
         self._receivers: dict[tuple[float, int], tuple[int, ...]] = {}
         for t, kind, node, peer, *_ in self._log:
-            if kind == CODES["send"]:
+            if kind == SEND:
                 self._receivers[t, node] = (*self._receivers.get((t, node), ()), peer)
         self._inboxes: dict[int, list[tuple[int, Link, float]]] = {}
         clock = cast(Any, scenario.network.activation)
@@ -262,9 +262,6 @@ class ClockBlocks(BlockColumns, LoggedColumns):
         for model in self._models:
             if isinstance(model.moving, ChangingFlowModel) and piece < len(model.moving.pieces):
                 model.moving.begin(piece)
-
-    def _rows(self) -> Iterator[tuple[Any, ...]]:
-        return iter(self._log)
 
     def _move_all(self, time: float) -> None:
         self._move_truth(time)
@@ -288,21 +285,21 @@ class ClockBlocks(BlockColumns, LoggedColumns):
         self, time: float, kind: int, node: int, peer: int, message: int, age: float
     ) -> None:
         h, inboxes = self._scenario.topology.index.get(node, -1), self._inboxes
-        if kind == CODES["sense"]:
+        if kind == SENSE:
             self._move_truth(time)
             self._predict(h, time)
             self._update(h, self._samples.get(time, {}).get(h, []), time)
-        elif kind == CODES["transmit"] and self._shared:
+        elif kind == TRANSMIT and self._shared:
             self._messages[node] = self._emit_now(h, time, self._receivers.get((time, node), ()))
-        elif kind == CODES["send"]:
+        elif kind == SEND:
             payload = self._messages[node] if self._shared else self._emit_now(h, time, (peer,))
             self._messages[node, peer, message] = payload
-        elif kind in (CODES["lost"], CODES["late"]):
-            sender, receiver = (node, peer) if kind == CODES["lost"] else (peer, node)
+        elif kind in (LOST, LATE):
+            sender, receiver = (node, peer) if kind == LOST else (peer, node)
             self._messages.pop((sender, receiver, message), None)
-        elif kind == CODES["deliver"]:
+        elif kind == DELIVER:
             inboxes.setdefault(node, []).append((peer, (peer, node, message), age))
-        elif kind == CODES["absorb"]:
+        elif kind == ABSORB:
             self._predict(h, time)
             arrived = sorted(inboxes.pop(node, []), key=lambda m: (m[0], -m[2], m[1]))
             heard = arrived

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import bisect
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -26,12 +26,7 @@ from netkf.theory.common.increments import IncrementFlows, increment_flows
 from netkf.theory.common.linear_verbs import LinearVerbs
 from netkf.theory.common.observations import Observation, timed_observations
 from netkf.trace.run import Run
-from netkf.trace.schema import CODES
-
-SENSE, SEND, DELIVER, ABSORB, TRANSMIT = (
-    CODES[kind] for kind in ("sense", "send", "deliver", "absorb", "transmit")
-)
-CRASH, LEAVE, RESTART, JOIN = (CODES[kind] for kind in ("crash", "leave", "restart", "join"))
+from netkf.trace.schema import ABSORB, CRASH, DELIVER, JOIN, LEAVE, RESTART, SEND, SENSE, TRANSMIT
 
 LARGE, CHECKS = 1e4, 256
 """Size of the true state, in standard deviations of an error, from which on the origin moves, and
@@ -57,7 +52,8 @@ class ClockColumns(LoggedColumns):
     def __init__(self, scenario: Scenario, run: Run) -> None:
         self._scenario = scenario
         self._run = run
-        self._log = [run.log[name].tolist() for name in ("t", "kind", "node", "peer", "message")]
+        columns = (run.log[name].tolist() for name in ("t", "kind", "node", "peer", "message"))
+        self._log = list(zip(*columns, strict=True))
         self._forms_of_all = forms = Forms(scenario.plant.n * (len(scenario.nodes) + 1))
         plant = cast(Any, scenario.plant)
         self.n = plant.n
@@ -158,9 +154,6 @@ class ClockColumns(LoggedColumns):
             gap = self._gap(h, time)
             if gap > 0.0:
                 self._filters.predict(h, gap)
-
-    def _rows(self) -> Iterator[tuple[Any, ...]]:
-        return zip(*self._log, strict=True)
 
     def _apply(self, time: float, kind: int, node: int, peer: int, message: int) -> None:
         if kind == SENSE:
@@ -389,18 +382,14 @@ class ClockColumns(LoggedColumns):
         self._kept.append(self._forms_of_all.freeze(self._forms()))
 
 
-def _delivered(log: list[list[Any]]) -> set[tuple[int, int, int]]:
-    return {
-        (peer, node, message)
-        for _, kind, node, peer, message in zip(*log, strict=True)
-        if kind == DELIVER
-    }
+def _delivered(log: list[tuple[Any, ...]]) -> set[tuple[int, int, int]]:
+    return {(peer, node, message) for _, kind, node, peer, message in log if kind == DELIVER}
 
 
-def _most_messages(log: list[list[Any]], delivered: set[tuple[int, int, int]]) -> int:
+def _most_messages(log: list[tuple[Any, ...]], delivered: set[tuple[int, int, int]]) -> int:
     """Return a number of messages that are never under way at once."""
     under_way, most, waiting = 0, 0, Counter[int]()
-    for _, kind, node, peer, message in zip(*log, strict=True):
+    for _, kind, node, peer, message in log:
         if kind == SEND and (node, peer, message) in delivered:
             under_way += 1
             most = max(most, under_way)

@@ -88,6 +88,7 @@ class LoggedColumns(ErrorColumns):
 
     _scenario: Scenario
     _run: Run
+    _log: list[tuple[Any, ...]]  # rows that begin with their times
     _changes: list[float]
     _samples: dict[float, Any]
     _piece: int
@@ -110,10 +111,6 @@ class LoggedColumns(ErrorColumns):
             self._laws[gap] = F[0], root[0]
         return self._laws[gap]
 
-    def _rows(self) -> Iterator[tuple[Any, ...]]:
-        """Yield the rows of the log, which begin with their times."""
-        raise NotImplementedError
-
     def _apply(self, *row: Any) -> None:
         raise NotImplementedError
 
@@ -127,7 +124,7 @@ class LoggedColumns(ErrorColumns):
 
     def replay(self) -> Iterator[None]:
         """Repeat the log of the run; yield at each of ``run.times``."""
-        rows = self._rows()
+        rows = iter(self._log)
         row = next(rows, None)
         for until in self._run.times.tolist():
             while row is not None and row[0] <= until:
