@@ -726,7 +726,9 @@ def _place_nodes(
 
 
 def _read_positions(source: SourceFile) -> tuple[dict[int, tuple[float, float]], list[int]]:
-    names = tuple(read_header(source)[:3])
+    header, named = read_header(source), ("node", "x", "y")
+    # Columns of other names, such as mote,x_m,y_m, come in this order.
+    names = named if {*named} <= {*header} else tuple(header[:3])
     if len(names) < 3:
         rule = f"{source.name} must have the columns node, x, y"
         raise ScenarioError("path", rule, list(names), "add what is missing")

@@ -87,6 +87,19 @@ def test_a_probability_that_a_table_leaves_open_is_not_made_up(tmp_path):
     assert graphs.CsvGraph(path=str(path)).build(0).links == ((1, 2), (2, 3))
 
 
+@pytest.mark.parametrize("header", ["node,x,y", "y,node,x", "mote,x_m,y_m", "node,x,y,z"])
+def test_a_table_of_places_is_read_by_its_names_or_else_in_their_order(tmp_path, header):
+    links, places = tmp_path / "links.csv", tmp_path / "places.csv"
+    links.write_text("sender,receiver\n0,1\n")
+    columns = {"y": [3, 4], "z": [9, 9], "node": [0, 1], "x": [1, 0]}
+    columns |= {"mote": columns["node"], "x_m": columns["x"], "y_m": columns["y"]}
+    rows = zip(*(columns[name] for name in header.split(",")), strict=True)
+    text = "".join(",".join(map(str, row)) + "\n" for row in rows)
+    places.write_text(f"{header}\n{text}")
+    topology = graphs.CsvGraph(path=str(links), positions=str(places)).build(0)
+    assert topology.positions == {0: (1.0, 3.0), 1: (0.0, 4.0)}
+
+
 def test_intel_lab_network():
     topology = netkf.load(SCENARIOS / "intel_lab.toml").topology
     assert (len(topology.nodes), len(topology.links)) == (53, 202)
