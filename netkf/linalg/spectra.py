@@ -107,7 +107,7 @@ def _hides(A: FloatArray, C: FloatArray, value: complex) -> bool:
     """Return True if A - value I and C have a common null vector, but for HIDDEN."""
     size = float(np.linalg.norm(A, 2)) or 1.0
     largest = float(np.abs(C).max(initial=0.0)) or 1.0
-    pencil = np.concatenate([A - value * np.eye(len(A)), C * (size / largest)])
+    pencil = np.concatenate([A - value * np.eye(len(A)), C / largest * size])
     return bool(np.linalg.svd(pencil, compute_uv=False)[-1] < HIDDEN * size)
 
 

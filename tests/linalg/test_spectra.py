@@ -97,6 +97,7 @@ def test_a_fast_state_that_follows_a_slow_one_shows_it(small):
         scaled = F * units / units[:, None]
         assert hidden_mode(scaled, show * units, FACTOR) is None
         assert small == 1e-6 or hidden_mode(scaled, hide * units, FACTOR) == 1.0
+        assert hidden_mode(scaled, 5e-324 * show, FACTOR) is None
         assert np.isfinite(balance(scaled)[1]).all()
 
 
