@@ -20,7 +20,7 @@ from netkf.algorithms.kernels.run import (
     carry,
     copy_estimate,
     predict_estimate,
-    shift_vector,
+    shift_prior,
     use_reading,
 )
 from netkf.algorithms.records import Kernels, Record
@@ -87,13 +87,6 @@ def add_consensus_term(record: Any, h: int, run: Any) -> None:
     add_covariance_product(lanes, run.size, record.xhat, h, gain, S, run.row, run.gains)
 
 
-@kernel
-def shift(record: Any, h: int, run: Any) -> None:
-    """Move estimate and prediction: the consensus term is made of differences."""
-    shift_vector(run, record.xhat, h)
-    shift_vector(run, record.prior, h)
-
-
 def kcf_record(filtering: Kcf, _infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
     """Return predictions of nodes, (xbar, root) in messages, and the settings."""
     estimate = {"xhat": (n := len(models[0].information),), "root": (n, n)}
@@ -132,7 +125,7 @@ class Kcf(Filter):
         predict=predict,
         emit=emit,
         absorb=absorb,
-        shift=shift,
+        shift=shift_prior,  # the consensus term is made of differences
         sends_readings=True,
         record=kcf_record,
         begin=begin_kcf,

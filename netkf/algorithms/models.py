@@ -451,20 +451,15 @@ class RateModel(FlowModel):
         for function in (self.f, self.jacobian):
             function.raise_error()
 
-    def _move(
+    def predict(
         self, xhat: FloatArray, root: FloatArray, gap: float
     ) -> tuple[FloatArray, FloatArray]:
+        """Return the estimate and the root of its covariance, see ``FlowModel.predict``."""
         n = len(xhat)
         x, S = np.array(xhat).reshape(1, n, 1), np.array(root).reshape(1, n, n, 1)
         move_by_rate(self._rate_tables, x, S, 0, self.now, gap)
         self.raise_error()
         return x.reshape(n), S.reshape(n, n)
-
-    def predict(
-        self, xhat: FloatArray, root: FloatArray, gap: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the estimate and the root of its covariance, see ``FlowModel.predict``."""
-        return self._move(xhat, root, gap)
 
     def extrapolate(
         self, xhat: FloatArray, root: FloatArray, age: float
@@ -472,7 +467,7 @@ class RateModel(FlowModel):
         """Return the estimate and the root of its covariance, see ``FlowModel.extrapolate``."""
         if age <= 0.0:
             return xhat, root
-        return self._move(xhat, root, age)
+        return self.predict(xhat, root, age)
 
     def transition(self, xhat: FloatArray, gap: float) -> FloatArray:
         """Return the derivative (n, n) of the predicted estimate at ``xhat`` (n,), by central

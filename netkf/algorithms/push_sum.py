@@ -39,7 +39,7 @@ from netkf.algorithms.kernels.estimates import (
     rotate,
     transform_mean,
 )
-from netkf.algorithms.kernels.run import predict_estimate, shift_vector, write_innovation
+from netkf.algorithms.kernels.run import predict_estimate, write_innovation
 from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.kernels.triggers import is_positive
 from netkf.algorithms.models import SlotModel
@@ -403,12 +403,6 @@ def observe(record: Any, h: int, run: Any) -> None:
         store(lanes, record.conserved, h, k, value)
 
 
-@kernel
-def shift_payload(record: Any, m: int, run: Any) -> None:
-    """Move the estimate in payload m with the origin; mass does not change."""
-    shift_vector(run, record.payload.xhat, m)
-
-
 def push_sum_message_size(n: int, _rows: int, phase: int) -> int:
     """Return the numbers in a message about n states: mass w, n~, C~, or an estimate z; under
     clocks (``phase`` -1) a weight, an information P^-1 and P^-1 xhat, which for a plant with modes
@@ -511,7 +505,6 @@ SLOTS = Kernels(
     update=update,
     emit=emit,
     absorb=absorb,
-    shift_payload=shift_payload,
     observe=observe,
     under_clocks=running_sums.KERNELS,
 )

@@ -26,7 +26,7 @@ from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
 from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.kernels.estimates import update_by_row
 from netkf.algorithms.kernels.run import absorb as nothing
-from netkf.algorithms.kernels.run import predict_estimate, shift_vector, use_reading
+from netkf.algorithms.kernels.run import predict_estimate, shift_prior, use_reading
 from netkf.algorithms.kernels.triggers import NO_READING, silence_probability, weigh_news
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
@@ -174,13 +174,6 @@ def absorb_readings(record: Any, h: int, run: Any) -> None:
             use_silence(record, h, run, record.rows, w, silent)
 
 
-@kernel
-def shift_prior(record: Any, h: int, run: Any) -> None:
-    """Move estimate and prediction: innovations do not change."""
-    shift_vector(run, record.xhat, h)
-    shift_vector(run, record.prior, h)
-
-
 def scheduled_readings_record(
     filtering: ScheduledReadings, infos: Sequence[NodeInfo], models: Sequence[Any]
 ) -> Record:
@@ -237,7 +230,7 @@ class ScheduledReadings(Filter):
         update=nothing,  # a reading is used in the exchange of its slot, if it is sent
         emit=emit_reading,
         absorb=absorb_readings,
-        shift=shift_prior,
+        shift=shift_prior,  # innovations do not change
         shift_payload=nothing,
         sends_readings=True,
         decides=True,

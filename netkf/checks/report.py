@@ -70,9 +70,11 @@ def _describe_row(row: Evidence) -> str:
     parts = [f"needs about {row.needed:,} runs"] if row.needed is not None else []
     # A row that compares exactly has no interval: low and high are equal.
     if row.low < row.high:
-        parts.append(
-            f"off by {row.off:.3g}, at most {max(0.0, -row.low):.3g}{_describe_limits(row)}"
-        )
+        limits = [f"{row.tolerance:g} is tolerated"] if row.tolerance else []
+        if row.detectable > 0.0:
+            limits.append(f"an error of {row.detectable:.2g} is detectable")
+        off = f"off by {row.off:.3g}, at most {max(0.0, -row.low):.3g}"
+        parts.append(off + (f" ({'; '.join(limits)})" if limits else ""))
         if math.isfinite(row.seen) and math.isfinite(row.expected):
             parts.append(f"seen {row.seen:.4g}, expected {row.expected:.4g}")
     return "; ".join([*parts, row.evidence])
@@ -84,13 +86,6 @@ def _summarise_row(row: Evidence) -> str:
     needed = f"needs about {row.needed:,} runs; " if row.needed is not None else ""
     limit = f"detectable {row.detectable:.2g}" if row.detectable > 0.0 else row.evidence
     return f"{needed}off by {row.off:.3g}, at most {max(0.0, -row.low):.3g}; {limit}"
-
-
-def _describe_limits(row: Evidence) -> str:
-    limits = [f"{row.tolerance:g} is tolerated"] if row.tolerance else []
-    if row.detectable > 0.0:
-        limits.append(f"an error of {row.detectable:.2g} is detectable")
-    return f" ({'; '.join(limits)})" if limits else ""
 
 
 def verdict_json(verdict: Verdict) -> dict[str, Any]:

@@ -34,12 +34,8 @@ ENVELOPE = {name: name for name in ("law", "quantity", "replay", "low", "median"
 """Headings of the columns of each table."""
 
 
-def format_fit(fit: LogFit) -> str:
-    """Return the tables of a fit as text: links, tests of assumptions, laws, and their verdicts."""
-    return "\n".join(_lines(fit))
-
-
 def _lines(fit: LogFit) -> Iterator[str]:
+    """Yield the tables of a fit: links, tests of assumptions, laws, and their verdicts."""
     links = fit.links.sort_values("delivery_probability", kind="stable")
     yield _text(links.assign(link=links["sender"] + " -> " + links["receiver"]), LINKS, 1)
     made_by = fit.tests["made_by"].where(fit.tests["verdict"] == "rejected", "")
@@ -86,7 +82,7 @@ def _run(options: argparse.Namespace) -> int:
         files = {law: str(path) for law, path in found.scenarios.items()}
         print_json({**tables, "notes": found.notes, "scenarios": files})
     else:
-        print(format_fit(found))
+        print("\n".join(_lines(found)))
     return 0
 
 

@@ -103,14 +103,6 @@ class ConnectivitySink(Sink):
                 up[:, d] &= self._contacts.in_contact(entity, t)
         return up
 
-    def _nodes_up(self, t: FloatArray) -> np.ndarray:
-        up = np.ones((len(t), len(self.nodes_connected)), dtype=bool)
-        for node, life in self._lives.items():
-            # A change takes effect before the sample of its instant.
-            changes = np.searchsorted([change.time for change in life.changes], t, side="right")
-            up[:, self._scenario.topology.index[node]] = life.up ^ (changes % 2 == 1)
-        return up
-
     def _parts(self, up: np.ndarray) -> tuple[int, np.ndarray]:
         """Return in how many parts the links ``up`` (D,) join the nodes, and that of each (N,)."""
         size, ends, topology = len(self._scenario.nodes), self._ends[up].T, self._scenario.topology
@@ -128,7 +120,11 @@ class ConnectivitySink(Sink):
 
     def _look(self, t: FloatArray, links: np.ndarray) -> None:
         """Count the samples at ``t`` (T,), when these ``links`` (T, D) are up if their ends are."""
-        nodes = self._nodes_up(t)
+        nodes = np.ones((len(t), len(self.nodes_connected)), dtype=bool)
+        for node, life in self._lives.items():
+            # A change takes effect before the sample of its instant.
+            changes = np.searchsorted([change.time for change in life.changes], t, side="right")
+            nodes[:, self._scenario.topology.index[node]] = life.up ^ (changes % 2 == 1)
         links &= nodes[:, self._ends[:, 0]] & nodes[:, self._ends[:, 1]]
         states = np.packbits(np.concatenate([links, nodes], axis=1), axis=1)
         _, first, weights = np.unique(states, axis=0, return_index=True, return_counts=True)

@@ -30,7 +30,6 @@ from netkf.runs.simulate import choose_engine, require_scenario
 from netkf.runs.summary import (
     PromisedTraces,
     SummarySink,
-    conserved_sums,
     promise_traces,
     summarise,
 )
@@ -188,7 +187,10 @@ class _Output:
         if self.network and self.network[0].connectivity.changes:
             summary["connectivity"] = self.network[0].connectivity.entry()
         if sums:
-            summary["conserved"] = conserved_sums(sums)
+            summary["conserved"] = {
+                name: {"exact": exact, "total": total, "drift": (total - exact) / exact}
+                for name, (exact, total) in sums.items()
+            }
         # How much of the recorded tables (readings, losses) the run has used; a run that ended
         # early did not use all that a complete one would have.
         if status == "complete":

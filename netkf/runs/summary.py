@@ -297,11 +297,3 @@ def _clipping_notes(scenario: Scenario, clipped: int) -> list[str]:
     limit = scenario.network.quantise.range if scenario.network.quantise is not None else math.nan
     numbers = "1 number was" if clipped == 1 else f"{clipped} numbers were"
     return [f"{numbers} beyond the range of messages, -{limit:g} to {limit:g}, and clipped"]
-
-
-def conserved_sums(sums: dict[str, tuple[float, float]]) -> dict[str, Any]:
-    """Return the entry of summary.json on conserved sums, from (exact, last) by name."""
-    return {
-        name: {"exact": exact, "total": total, "drift": (total - exact) / exact}
-        for name, (exact, total) in sums.items()
-    }

@@ -161,7 +161,10 @@ def _check_sensors(scenario: DerivedScenario) -> None:
         if isinstance(sensor, RegressorSensor):
             shapes.check_regressor(scenario, key, sensor)
         elif not sensor.linear:
-            shapes.check_nonlinear(scenario, key, sensor)
+            with errors_under(key):
+                # First as it is: a wrong field is reported before positions that the graph lacks.
+                for candidate in (sensor, sensor.located(scenario.topology.positions)):
+                    candidate.check_state(n)
         else:
             shapes.require_shape(f"{key}.H", sensor.H, (None, n), f"the state has {n} components")
             p = len(sensor.H)

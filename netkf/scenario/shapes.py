@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from netkf.core.errors import ScenarioError, errors_under
+from netkf.core.errors import ScenarioError
 from netkf.linalg.arrays import FloatArray
 from netkf.plants.curves import NonlinearDiffusion
-from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.regressors import RegressorSensor
 from netkf.scenario.derived import DerivedScenario
 
@@ -75,14 +74,6 @@ def check_regressor(scenario: DerivedScenario, key: str, sensor: RegressorSensor
     require_shape(f"{key}.start", sensor.start, (m,), why)
     require_shape(f"{key}.xi_cov", sensor.xi_cov, (q, q), f"{key}.B has {q} columns")
     require_shape(f"{key}.R", sensor.R, (1, 1), "a regressor gives one number a slot")
-
-
-def check_nonlinear(scenario: DerivedScenario, key: str, sensor: NonlinearSensor) -> None:
-    """Raise ScenarioError if a nonlinear sensor cannot read the state, or has no positions."""
-    with errors_under(key):
-        # First as it is: a wrong field is reported before positions that the graph lacks.
-        for candidate in (sensor, sensor.located(scenario.topology.positions)):
-            candidate.check_state(scenario.plant.n)
 
 
 def check_weights(scenario: DerivedScenario) -> None:

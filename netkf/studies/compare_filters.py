@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -20,7 +20,7 @@ from netkf.core.notebook import NotebookTable
 from netkf.core.printable import one_line, shorten
 from netkf.ensembles.pool import Pool
 from netkf.ensembles.pools import PoolOptions, make_pool
-from netkf.ensembles.replicas import replicate_blocks, results_of
+from netkf.ensembles.replicas import Progress, replicate_blocks, results_of
 from netkf.runs.curves import ErrorCurve
 from netkf.runs.documents import file_digests, write_sealed
 from netkf.runs.failures import explain_failures
@@ -55,7 +55,6 @@ CURVES = "errors.parquet"
 CARRIED = ("mean", "cov", "model", "estimates")
 """Keys of ``[filter]`` that every compared filter takes over from the scenario."""
 MAX_FILTERS = 200
-Progress = Callable[[int, int], None]
 Choice = str | Mapping[str, Any] | Filter
 """A filter: its kind, its table in a scenario file, or an object."""
 

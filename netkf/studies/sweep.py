@@ -17,7 +17,7 @@ from netkf.core.errors import TheoryError
 from netkf.core.fields import require_runs
 from netkf.ensembles.pool import Pool
 from netkf.ensembles.pools import ANYWHERE, PoolOptions, make_pool
-from netkf.ensembles.replicas import replicate_blocks, results_of
+from netkf.ensembles.replicas import Progress, replicate_blocks, results_of
 from netkf.linalg.arrays import FloatArray
 from netkf.rng.streams import Streams
 from netkf.runs.documents import write_sealed
@@ -49,7 +49,6 @@ if TYPE_CHECKING:
 
 SHOWN = 20  # instants at which truths are compared
 Row = dict[str, Any]
-Progress = Callable[[int, int], None]
 
 
 def sweep(

@@ -585,6 +585,13 @@ def shift(record: Any, h: int, run: Any) -> None:
 
 
 @kernel
+def shift_prior(record: Any, h: int, run: Any) -> None:
+    """Move the estimate of node ``h``, and what it was before the reading, with the origin."""
+    shift_vector(run, record.xhat, h)
+    shift_vector(run, record.prior, h)
+
+
+@kernel
 def shift_payload(record: Any, m: int, run: Any) -> None:
     """Move the estimate in payload ``m`` with the origin."""
     shift_vector(run, record.payload.xhat, m)

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from functools import partial
 from typing import Any
-
-import simpy
 
 from netkf.core.clock import ClockPosition, next_ticks
 from netkf.engines.base import Rank
 from netkf.engines.simpy.nodes import ClockedNode
-from netkf.engines.simpy.timeline import Timeline
+from netkf.engines.simpy.timeline import Process, Timeline
 from netkf.engines.simpy.transmission import DirectedLink, LinkExchange, Transmitter, stream
 from netkf.network.clocks import LinkClock
 from netkf.network.node_clocks import node_time, owner_of
@@ -23,7 +21,6 @@ from netkf.trace.schema import TICK, TRANSMIT
 
 FIRST_BLOCK, MAX_BLOCK = 8, 1024  # ticks of a clock that are drawn at once: at first, and at most
 
-Process = Generator[simpy.Event, Any, None]
 Activation = Callable[[float], None]
 """A callback for the tick of a clock, called with its time in seconds."""
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import simpy
 
 from netkf.algorithms.kernels.maps import spread_of
 from netkf.algorithms.models import MapModel, RateModel
@@ -21,7 +20,7 @@ from netkf.engines.simpy.membership import Membership
 from netkf.engines.simpy.nodes import ClockedNode, Node, View, distinct
 from netkf.engines.simpy.sensors import increment_sensors, sensor_processes
 from netkf.engines.simpy.slots import FIRST_RANK, Reader, SlotClock, SlotNode, SlotSchedule
-from netkf.engines.simpy.timeline import Timeline
+from netkf.engines.simpy.timeline import Process, Timeline
 from netkf.engines.simpy.transmission import Transmitter
 from netkf.engines.soundness import sound_mask, stack_estimates
 from netkf.linalg.arrays import FloatArray
@@ -31,8 +30,6 @@ from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import DIVERGED
-
-Process = Generator[simpy.Event, Any, None]
 
 
 class DivergedError(Exception):

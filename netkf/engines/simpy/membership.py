@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
 from functools import partial
 from typing import Any
 
-import simpy
-
 from netkf.engines.base import Rank
-from netkf.engines.simpy.timeline import Timeline
+from netkf.engines.simpy.timeline import Process, Timeline
 from netkf.network.lives import Lifetime, lifetimes
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES
-
-Process = Generator[simpy.Event, Any, None]
 
 
 class Membership:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import simpy
-
 from netkf.engines.base import Rank
 from netkf.engines.simpy.nodes import ClockedNode
-from netkf.engines.simpy.timeline import Timeline
+from netkf.engines.simpy.timeline import Process, Timeline
 from netkf.linalg.arrays import FloatArray
 from netkf.plants.readings import covariance_of
 from netkf.plants.sampling import Samples
@@ -20,8 +18,6 @@ from netkf.scenario.model import PlacedSensor
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import SENSE
-
-Process = Generator[simpy.Event, Any, None]
 
 
 def sensor_processes(

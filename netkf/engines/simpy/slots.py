@@ -11,13 +11,12 @@ from collections.abc import Callable, Generator
 from typing import Any, NamedTuple
 
 import numpy as np
-import simpy
 
 from netkf.algorithms.filter import Exchange, PairReading, Reading
 from netkf.algorithms.models import ChangingSlotModel
 from netkf.engines.base import Rank
 from netkf.engines.simpy.nodes import Envelope, Node, distinct
-from netkf.engines.simpy.timeline import Timeline
+from netkf.engines.simpy.timeline import Process, Timeline
 from netkf.engines.simpy.transmission import LinkExchange, Transmitter
 from netkf.linalg.arrays import FloatArray, block_diagonal
 from netkf.network.channels import senders_of_pairs
@@ -31,8 +30,6 @@ from netkf.trace.schema import ABSORB, ROUND, SENSE, STOP, SWAP, TICK
 
 FIRST_RANK = Rank.PROBE + 1
 """The stages of a slot come after arrivals of the same instant; their ranks follow the schedule."""
-
-Process = Generator[simpy.Event, Any, None]
 
 
 class Stage(NamedTuple):

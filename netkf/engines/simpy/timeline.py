@@ -10,6 +10,8 @@ import simpy
 
 from netkf.engines.base import Rank
 
+Process = Generator[simpy.Event, Any, None]
+
 
 class Timeline(simpy.Environment):
     """SimPy with absolute times and an explicit order of simultaneous events.

@@ -118,13 +118,12 @@ class SlotColumns(ErrorColumns):
         for until in scenario.slot_plant.slots_of(run.times).tolist():
             while processed < until:
                 slot = processed if predicts else processed + 1
-                if not predicts:
-                    self._restart(slot)
                 if predicts:
                     self._simulate(slot, self._observe(slot), arrivals)
-                    self._move_truth(processed)
                 else:
-                    self._move_truth(processed)
+                    self._restart(slot)
+                self._move_truth(processed)
+                if not predicts:
                     self._simulate(slot, self._observe(slot), arrivals)
                 if self._x.shape[1] > max(FEW, 2 * self._fewest):
                     self._compress()
