@@ -20,7 +20,7 @@ import numpy as np
 
 from netkf.core.interrupts import defer_signals
 from netkf.linalg.arrays import FloatArray
-from netkf.trace.schema import CODES, EVENT, KINDS
+from netkf.trace.schema import CODES, DIVERGED, EVENT, KINDS
 
 BLOCK = 1 << 17  # rows; large enough that the system gives memory for them in large pages
 LONG = 1 << 14  # rows that are worth another thread
@@ -113,7 +113,7 @@ class Recorder:
         """Sums over all nodes that exchanges should conserve: at the start, at the last sample."""
         self.stats: dict[str, int] = {}
         """Counts that the engine keeps of its own work, such as SimPy processes and events."""
-        self._exact_errors = False
+        self._exact_errors, self._last_time = False, 0.0
         self.unknown: tuple[np.ndarray, np.ndarray] | None = None
         """Masks (n,) and (N, n) of states and of errors that are unknown; an engine sets it."""
 
@@ -168,6 +168,7 @@ class Recorder:
             return
         rows = np.array(self._rows, dtype=EVENT)
         self._rows.clear()
+        self._last_time = float(rows["t"][-1])
         self._run_or_submit(self._pass_on, rows)
 
     def extend(self, rows: np.ndarray) -> None:
@@ -178,6 +179,7 @@ class Recorder:
             self._flush_gathered()
             if not len(rows):
                 return
+            self._last_time = float(rows["t"][-1])
             if self.counts_only:
                 self._count(rows["kind"])
                 return
@@ -240,6 +242,15 @@ class Recorder:
     def _pass_sample_on(self, *sample: FloatArray) -> None:
         for sink in self._sinks:
             sink.states(*sample)
+
+    def end_as_diverged(self, t: float, nodes: Sequence[int]) -> None:
+        """Record that the estimates of ``nodes`` (ids) are broken in the sample at ``t`` (seconds).
+
+        A sample of a slot may be taken when it ends: the time is that of the last event then.
+        """
+        t = max(t, self._rows[-1][0] if self._rows else self._last_time)
+        for node in nodes:
+            self.append((t, DIVERGED, node, -1, -1, -1, NAN))
 
     def count(self, kind: str) -> int:
         """Return the number of flushed events of a kind."""

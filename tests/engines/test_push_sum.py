@@ -11,6 +11,7 @@ from netkf.runs.run import run_to_directory
 from netkf.scenario.writing import to_toml
 from tests.cases import FOLDER
 from tests.conftest import SCENARIOS
+from tests.engines.agreement import assert_agree
 
 PLANAR = SCENARIOS / "push_sum_planar.toml"
 CASES = json.loads((FOLDER / "push_sum.json").read_text())["cases"]
@@ -201,8 +202,11 @@ def test_a_run_whose_estimates_or_covariances_overflow_says_so(planar):
         }
     )
     for changes in ({"network.channel.loss.delivery": 0.0}, {"filter.asymptotic": True}):
-        run = netkf.simulate(growing.replace({"filter.gamma": 1, **changes}))
+        run = assert_agree(growing.replace({"filter.gamma": 1, **changes}))
         assert run.status == "diverged"
+        # The sample is taken after the exchanges of its slot, and noticed then.
+        assert run.events["kind"].iloc[-1] == "diverged"
+        assert run.events["t"].is_monotonic_increasing
         assert np.isfinite(run.P[-1]).all() == ("filter.asymptotic" in changes)
 
 

@@ -10,9 +10,8 @@ from netkf.engines.base import Progress
 from netkf.engines.soundness import sound_mask
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.trace.recorder import NAN, Recorder
+from netkf.trace.recorder import Recorder
 from netkf.trace.run import StateSamples
-from netkf.trace.schema import DIVERGED
 
 
 def entries_of(scenario: Scenario) -> np.ndarray:
@@ -83,6 +82,6 @@ def record_samples(
         return True
     # Events up to the sample come first, and then which nodes have diverged.
     pass_rows_on(last)
-    for node in (scenario.nodes[k] for k in np.flatnonzero(~sound_filters[last])):
-        recorder.append((time, DIVERGED, node, -1, -1, -1, NAN))
+    broken = np.flatnonzero(~sound_filters[last]).tolist()
+    recorder.end_as_diverged(time, [scenario.nodes[k] for k in broken])
     return False

@@ -28,8 +28,7 @@ from netkf.linalg.plain import announce_plain
 from netkf.network.node_clocks import node_time
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
-from netkf.trace.recorder import NAN, Recorder
-from netkf.trace.schema import DIVERGED
+from netkf.trace.recorder import Recorder
 
 
 class DivergedError(Exception):
@@ -307,8 +306,7 @@ class _Simulation:
         recorder.flush_if_full()
         self._progress(time)
         # Recorded after the sample, which has the diverged estimate.
-        for node in diverged:
-            recorder.append((time, DIVERGED, node, -1, -1, -1, NAN))
+        recorder.end_as_diverged(time, diverged)
         if diverged:
             raise DivergedError
 
