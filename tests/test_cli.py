@@ -183,6 +183,7 @@ def test_refusals_do_not_wait_for_matplotlib(tmp_path):
         *(["plot", "run", "--figure", "eror"], ["plot", "absent"], ["plot", "run", "--figure", ""]),
         *(["plot", "run", "--out", "run/summary.json"], ["plot", "run", "--out", "b.png"]),
         *(["plot", "run", "run", "--out", "c.png"], ["plot", "run", "--format", "gif"]),
+        *(["plot", "run", "--out", "new.jpg"], ["plot", "run", "run", "--out", "new.EPS"]),
         *(["report", "absent"], ["report", "run", "--out", "run/summary.json"]),
         *(["report", "run", "--out", "b.png"], ["report", "run", "--out", "run"]),
         *(["report", "run", "run", "run"], ["report", "run", "--replica", "x"]),

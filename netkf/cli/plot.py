@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from importlib.util import find_spec
+from mimetypes import MimeTypes
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from netkf.cli.options import print_notes
 from netkf.core.errors import ScenarioError, suggest_nearest
 from netkf.core.extras import missing
 from netkf.core.printable import shorten
-from netkf.figures.names import FIGURE_NAMES, FIT_FIGURES, FIT_FILE, FORMATS
+from netkf.figures.names import FIGURE_NAMES, FIT_FIGURES, FIT_FILE, FORMATS, is_picture
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -45,9 +46,8 @@ def _run(options: argparse.Namespace) -> int:
     file_format = options.format or "png"
     if has_several and "error" in names:
         together = dict(zip(map(str, options.directories), results, strict=True))
-        is_file = options.out is not None and options.out.suffix.removeprefix(".") in FORMATS
         out = options.out or options.directories[0] / "figures"
-        target = out if is_file else out / f"errors.{file_format}"
+        target = out if is_picture(out) else out / f"errors.{file_format}"
         print(*plot_to_files(together, ("error",), target, file_format))
         names = tuple(name for name in names if name != "error")
         # Without names all figures would be drawn.
@@ -73,13 +73,17 @@ def _check_output(out: Path, directories: int, file_format: str | None) -> None:
         raise ScenarioError("--format", rule, file_format, "leave one of them out")
     if out.is_dir():
         return
-    if suffix in FORMATS:
+    if is_picture(out):
         if directories > 1:
             rule, remedy = "is one file for several directories", "name a directory"
             raise ScenarioError("--out", rule, str(out), remedy)
         require_own(out)
     elif out.exists():
         rule, remedy = "cannot be made (File exists)", "name a directory, or a new file NAME.png"
+        raise ScenarioError("--out", rule, str(out), remedy)
+    elif MimeTypes().guess_type(out.name)[0]:  # a directory x.jpg would be no picture
+        rule = "is no picture that netkf writes"
+        remedy = f"name a directory, or a file that ends in .{', .'.join(FORMATS)}"
         raise ScenarioError("--out", rule, str(out), remedy)
 
 

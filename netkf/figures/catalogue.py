@@ -10,7 +10,7 @@ from netkf.core.errors import ScenarioError, TheoryError, suggest_nearest
 from netkf.figures.consistency import nees_figure, nis_figure, whiteness_figure
 from netkf.figures.error import error_figure, quantiles_figure, ratios_figure
 from netkf.figures.figure_data import FigureData, UnavailableError, reduce_result
-from netkf.figures.names import FIT_FIGURES, FORMATS
+from netkf.figures.names import FIT_FIGURES, is_picture
 from netkf.figures.network import network_figure
 from netkf.figures.outcomes import envelope_figure, fate_figure, losses_figure, matrix_figure
 from netkf.figures.pictures import overview
@@ -136,7 +136,7 @@ def plot_to_files(result: Any, names: tuple[str, ...], out: Path, file_format: s
     figure_set = FigureSet(result)
     omit_slow = not names
     names = names or figure_set.names
-    is_file = out.suffix.removeprefix(".").lower() in FORMATS and not out.is_dir()
+    is_file = is_picture(out)
     if is_file and len(names) > 1:
         rule, remedy = "is one file for several figures", "name a directory, or one --figure"
         raise ScenarioError("--out", rule, str(out), remedy)

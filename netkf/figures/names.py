@@ -1,5 +1,6 @@
 """Names of figures, formats of their files and the looks of series, without matplotlib."""
 
+from pathlib import Path
 from typing import Any, NamedTuple
 
 FORMATS = ("png", "svg", "pdf")
@@ -13,6 +14,11 @@ FIT_FIGURES = ("envelope",)
 """The figures of a fit."""
 FIT_FILE = "fit_envelope.csv"
 """The file of a fit that is drawn."""
+
+
+def is_picture(out: Path) -> bool:
+    """Return True if ``out`` names a file of a figure, False for a directory of them."""
+    return out.suffix.removeprefix(".").lower() in FORMATS and not out.is_dir()
 
 
 class SeriesStyle(NamedTuple):

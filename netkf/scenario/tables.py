@@ -60,14 +60,24 @@ def change_keys(scenario: S, changes: Any) -> S:
     if not isinstance(changes, Mapping):
         rule, remedy = "must be values by key", "write {'network.activation.rate': 5.0}"
         raise ScenarioError("changes", rule, changes, remedy)
-    folder = getattr(scenario, "_folder", None)
-    if folder is None:
-        folder = next((s.folder for s in source_files(scenario)), Path.cwd())
     try:
-        origin = Origin(folder, getattr(scenario, "_trust", True))
+        origin = _origin_of(scenario)
         return build_scenario(type(scenario), change_table(as_table(scenario), changes), origin)
     except ScenarioError as error:
         raise explain_left_over(error, changes) from None
+
+
+def _origin_of(scenario: DerivedScenario) -> Origin:
+    folder = getattr(scenario, "_folder", None)
+    if folder is None:
+        folder = next((s.folder for s in source_files(scenario)), Path.cwd())
+    return Origin(folder, getattr(scenario, "_trust", True))
+
+
+def check_filter_table(scenario: DerivedScenario, table: Mapping[str, Any]) -> None:
+    """Raise ScenarioError for keys and values of [filter] that are wrong in every scenario."""
+    with errors_under("filter"):
+        _build_filtering(_origin_of(scenario), table)
 
 
 def explain_left_over(error: ScenarioError, changes: Mapping[str, Any]) -> ScenarioError:

@@ -32,6 +32,7 @@ from netkf.runs.simulate import choose_engine, require_scenario
 from netkf.scenario.imports import offered_kinds
 from netkf.scenario.registry import list_kinds, name_of
 from netkf.scenario.scenario import Scenario
+from netkf.scenario.tables import check_filter_table
 from netkf.scenario.writing import as_table, part_as_table
 from netkf.studies.filter_values import (
     JUDGED,
@@ -196,7 +197,8 @@ def compare_filters(
     right together with probability ``confidence``. ``runs``, ``seed`` and the other options are
     those of ``netkf.monte_carlo``, for each filter.
 
-    Raises ScenarioError if no filter can run, or if there is no such kind.
+    Raises ScenarioError if no filter can run, if there is no such kind, or for a table with a wrong
+    key or value.
     """
     require_scenario(scenario, "compare_filters", ", ...")
     confidence = number(above=0.0, below=1.0)("confidence", confidence)
@@ -322,6 +324,8 @@ def _make_candidate(scenario: Scenario, choice: Choice, engine: str) -> FilterEn
             {} if isinstance(choice, str) else {k: v for k, v in choice.items() if k != "kind"}
         )
         label = _make_label(str(table["kind"]), settings)
+        if settings:  # what is misspelled in them is no matter of the scenario
+            check_filter_table(scenario, table)
         make = partial(scenario.replace, {"filter": table})
     try:
         candidate = make()

@@ -248,6 +248,7 @@ def test_the_command_writes_files(results, tmp_path, capsys):
         ([str(folder), "--figure", ""], "--figure: must name figures"),
         ([str(folder), "--out", str(tmp_path / "one.png")], "one file for several figures"),
         ([str(folder), "--out", str(folder / "manifest.json")], "cannot be made (File exists)"),
+        ([str(folder), "--out", str(tmp_path / "x.jpg")], "a file that ends in .png, .svg, .pdf"),
     ):
         assert main(["plot", *arguments]) == 2
         line = capsys.readouterr().err
@@ -290,8 +291,8 @@ def test_errors_of_several_results_are_drawn_in_one_figure(results, tmp_path, ca
     assert main(["plot", *folders, "--figure", "error,age", "--out", str(tmp_path / "o")]) == 0
     written = [str(tmp_path / "o" / name) for name in ("errors.png", "a/age.png", "b/age.png")]
     assert capsys.readouterr().out.splitlines() == written
-    assert main(["plot", *folders, "--figure", "error", "--out", str(tmp_path / "e.svg")]) == 0
-    assert (tmp_path / "e.svg").exists()
+    assert main(["plot", *folders, "--figure", "error", "--out", str(tmp_path / "e.SVG")]) == 0
+    assert (tmp_path / "e.SVG").is_file()
 
 
 def test_a_map_that_takes_minutes_is_drawn_on_request_only(results, monkeypatch, capsys, tmp_path):

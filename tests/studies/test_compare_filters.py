@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 
 import numpy as np
 import pandas as pd
@@ -180,6 +181,20 @@ def test_what_cannot_run_says_why(found, scenario):
             netkf.compare_filters(scenario, ["icf", odd], runs=2)
     with pytest.raises(netkf.ScenarioError, match="must differ from each other"):
         netkf.compare_filters(scenario, ["icf", "icf"], runs=2)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"stepss": 2}, 'filter.stepss: is not a key here; got 2; did you mean "steps"?'),
+        ({"steps": "x"}, "filter.steps: must be"),
+        ({"consensus": "inf"}, "filter.consensus: must be one of"),
+        ({"gate": {"nis": 9.0}}, "filter.gate.nis: is not a key here"),
+    ],
+)
+def test_a_misspelt_filter_is_refused_rather_than_noted(scenario, settings, message):
+    with pytest.raises(netkf.ScenarioError, match=re.escape(message)):
+        netkf.compare_filters(scenario, ["icf", {"kind": "hcmci", **settings}], runs=2)
 
 
 def test_objects_of_one_kind_are_told_apart_by_the_settings_that_differ(scenario):
