@@ -78,7 +78,8 @@ class NonlinearDiffusion(NonlinearStates):
             return np.zeros(0), np.zeros((0, 0)), np.zeros((3, 0))
         inputs = getattr(self.input, "inputs", (self.input,))
         steps = [u for u in inputs if not isinstance(u, SineInput)]
-        times = np.unique(np.concatenate([np.zeros(0), *(u.exogenous.times for u in steps)]))
+        # All begin at 0: to a clock that is behind there is no input before.
+        times = np.unique(np.concatenate([np.zeros(1), *(u.exogenous.times for u in steps)]))
         values = np.concatenate([u.values(times) for u in inputs], axis=1)
         sines = [
             u.components if isinstance(u, SineInput) else np.full((3, u.m), np.nan) for u in inputs

@@ -224,18 +224,25 @@ RANGES = {"kind": "range", "positions": [[1.0, 5.0], [0.0, 7.0], [4.0, -9.0]]}
 SLEEPS = [{"kind": "duty", "nodes": [1, 2], "period": 1.3, "up": 0.8, "memory": "lost"}]
 
 
+RECORDED = {"kind": "recorded", "path": "u.csv"}
+SINE = {"kind": "sine", "amplitude": 2.0, "frequency": 0.3, "phase": 1.0}
+
+
 @pytest.mark.parametrize(
-    ("kind", "at", "sensor", "lives"),
+    ("kind", "at", "sensor", "lives", "u"),
     [
-        ("kcf", "nodes", {"H": H.tolist()}, []),
-        ("intermittent", "readings", {"H": H.tolist()}, []),
-        pytest.param("gossip", "links", RANGES, SLEEPS, marks=pytest.mark.slow),
+        ("kcf", "nodes", {"H": H.tolist()}, [], RECORDED),
+        ("kcf", "nodes", {"H": H.tolist()}, [], SINE),
+        ("intermittent", "readings", {"H": H.tolist()}, [], RECORDED),
+        pytest.param("gossip", "links", RANGES, SLEEPS, RECORDED, marks=pytest.mark.slow),
     ],
 )
 def test_linear_plants_are_those_whose_f_is_linear(
-    scenario_of, tmp_path, kind, at, sensor, lives, monkeypatch
+    scenario_of, tmp_path, kind, at, sensor, lives, u, monkeypatch
 ):
-    """Estimates of a plant that is not linear are counted from no response to the input."""
+    """Estimates of a plant that is not linear are counted from no response to the input; before a
+    clock shows 0 there is none.
+    """
     (tmp_path / "u.csv").write_text("t,u0\n" + "".join(f"{t},{u}\n" for t, u in JUMPS))
     (tmp_path / "curved.py").write_text(CURVED.format(A=A.tolist(), G=G.tolist()))
     monkeypatch.syspath_prepend(tmp_path)
@@ -247,7 +254,8 @@ def test_linear_plants_are_those_whose_f_is_linear(
     }
     scenario = scenario_of(delay=0.13 if kind == "kcf" else 0.4, horizon=4.0).replace(
         {
-            "plant": {"kind": "diffusion", "A": A.tolist(), "input": DRIVEN["plant.input"]} | small,
+            "plant": {"kind": "diffusion", "A": A.tolist()} | small
+            | {"input": u | {"G": G[:, None].tolist()}},
             "sensors": [every | sensor],
             "network.activation": {"kind": "readings"} if at == "readings"
             else {"kind": "periodic", "period": 0.3, "at": at},
@@ -256,8 +264,7 @@ def test_linear_plants_are_those_whose_f_is_linear(
                        "model": {"B": [[0.2, 0.0], [0.0, 1.0]], "R": [[0.3]]}} | MORE.get(kind, {}),
         }
     )  # fmt: skip
-    recorded = {"kind": "recorded", "path": "u.csv"}
-    flow = {"kind": "nonlinear", "f": "curved:Flow", "step": 1e-3, **small, "input": recorded}
+    flow = {"kind": "nonlinear", "f": "curved:Flow", "step": 1e-3, **small, "input": u}
     run, other = (netkf.simulate(s) for s in (scenario, scenario.replace({"plant": flow})))
     assert len(run.log) == len(other.log)
     np.testing.assert_allclose(run.P, other.P, atol=1e-5)

@@ -90,7 +90,7 @@ def set_input(model: RateTables, time: float, middle: float) -> None:
     last = count_until(model.times, middle) - 1
     for k in range(len(model.u)):
         model.u[k] = model.values[last, k] if last >= 0 else 0.0
-        if not math.isnan(model.sine[0, k]):
+        if last >= 0 and not math.isnan(model.sine[0, k]):
             angle = model.sine[1, k] * time + model.sine[2, k]
             model.u[k] = model.sine[0, k] * math.sin(angle)
 
