@@ -20,11 +20,12 @@ class Quantisation(Component):
     """The numbers of payloads are sent with ``bits`` each, for values from -``range`` to ``range``.
 
     bits   of a number
-    range  largest size of a number; larger ones are clipped, and the run says how many were
+    range  numbers that are larger with their dither are clipped, and the run says how many were
 
     Both ends know a dither u, uniform over a step of ``2 range / 2^bits``: the sender rounds z + u,
-    the receiver subtracts u. The error is then uniform over a step, whatever z is, and independent
-    of it and of other errors (Roberts 1962; Schuchman 1964). Only exact zeros are received as 0.
+    the receiver subtracts u. Up to half a step below ``range`` nothing is clipped: the error is
+    uniform over a step, whatever z is, and independent of it and of other errors (Roberts 1962;
+    Schuchman 1964). Only exact zeros are received as 0.
     """
 
     bits: int = field(integer(low=1, high=MAX_BITS))

@@ -296,4 +296,5 @@ def _clipping_notes(scenario: Scenario, clipped: int) -> list[str]:
         return []
     limit = scenario.network.quantise.range if scenario.network.quantise is not None else math.nan
     numbers = "1 number was" if clipped == 1 else f"{clipped} numbers were"
-    return [f"{numbers} beyond the range of messages, -{limit:g} to {limit:g}, and clipped"]
+    ends = f"-{limit:g} to {limit:g}"
+    return [f"{numbers} with the dither beyond the range of messages, {ends}, and clipped"]

@@ -48,7 +48,8 @@ transmit node transmitted once, as its transmission number ``message``, to all t
 link     the link node - peer of a range graph is up (``message`` 1) or down (0), and was not when
          it was looked at last; it is down before the first look
 refuse   a gate refused a reading of one of node's sensors, or one that peer sent to node
-clip     a message that node sends has ``message`` numbers beyond the range of network.quantise
+clip     a message that node sends has ``message`` numbers that are, with their dither, beyond the
+         range of network.quantise
 join, leave  as restart and crash, of a node that a table lets join and leave the network
 """
 

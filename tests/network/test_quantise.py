@@ -84,6 +84,19 @@ def test_values_beyond_the_range_are_clipped_and_counted():
     assert (abs(received) <= 1.0).all()
 
 
+def test_what_is_within_half_a_step_of_the_ends_is_clipped_as_often_as_dither_carries_it_out():
+    quantisation, count = Quantisation(bits=4, range=3.0), 20_000
+    random = np.random.default_rng(3)
+    for below in (0.5, 0.25, 0.0):  # steps below the end
+        z = np.full(count, 3.0 - below * quantisation.step)
+        for sign in (1.0, -1.0):
+            received, clipped = quantisation.apply(sign * z, random)
+            off = 5.0 * np.sqrt(0.25 / count)
+            assert clipped / count == pytest.approx(0.5 - below, abs=off if below < 0.5 else 0.0)
+            bias = sign * (received - sign * z).mean() / quantisation.step
+            assert bias == pytest.approx(below - 0.5, abs=2.0 * off)
+
+
 def test_triangles_stay_triangles_and_symmetric_matrices_symmetric():
     encoder = Encoder(Quantisation(bits=5, range=4.0), np.random.default_rng(3))
     root = np.array([[1.0, 0.0, 0.0], [0.5, 2.0, 0.0], [-1.0, 0.2, 3.0]])
@@ -364,7 +377,10 @@ def test_a_summary_says_what_was_clipped(scenario_of):
     promised = PromisedTraces(None, np.nan, np.nan, "")
     notes = summarise(scenario, sink, promised, {"sent": 0, "delivered": 0, "lost": 0})["notes"]
     count = rows["message"].sum()
-    assert notes == [f"{count} numbers were beyond the range of messages, -0.4 to 0.4, and clipped"]
+    assert notes == [
+        f"{count} numbers were with the dither beyond the range of messages, -0.4 to 0.4, "
+        "and clipped"
+    ]
 
 
 def test_sizes_of_messages_follow_from_the_bits(scenario_of):
