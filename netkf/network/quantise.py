@@ -13,6 +13,8 @@ from netkf.linalg.compiling import kernel
 
 MAX_BITS = 48
 """More would be beyond the digits of a float64."""
+NOTHING = 1e-6
+"""Share of a step up to which a number is received as 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +27,8 @@ class Quantisation(Component):
     Both ends know a dither u, uniform over a step of ``2 range / 2^bits``: the sender rounds z + u,
     the receiver subtracts u. Up to half a step below ``range`` nothing is clipped: the error is
     uniform over a step, whatever z is, and independent of it and of other errors (Roberts 1962;
-    Schuchman 1964). Only exact zeros are received as 0.
+    Schuchman 1964). Zeros, also those that rounding makes of 0, are received
+    as 0.
     """
 
     bits: int = field(integer(low=1, high=MAX_BITS))
@@ -63,8 +66,9 @@ def quantise_number(
     dither = step * (unit - 0.5)
     level = np.floor((value + dither + limit) / step)
     kept = min(max(level, 0.0), levels - 1.0)
-    # What has heard of no mass must not divide by an error: nothing is told as nothing.
-    received = 0.0 if value == 0.0 else (kept + 0.5) * step - limit - dither
+    # What has heard of no mass must not divide by an error: nothing is told as nothing. A zero may
+    # be one but for rounding, which is not the same in both engines.
+    received = 0.0 if abs(value) <= NOTHING * step else (kept + 0.5) * step - limit - dither
     return received, kept != level
 
 

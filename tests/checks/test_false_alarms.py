@@ -389,9 +389,14 @@ def test_squares_of_other_noises_are_not_taken_for_chi_square(tmp_path):
 
 RARE = {"kind": "gilbert-elliott", "to_bad": 0.001, "to_good": 0.01}
 HEAVY = {"kind": "renewal", "distribution": "weibull", "shape": 0.2, "mean": 0.5}
+LONG = {"kind": "lognormal", "mean": 1.0, "sigma": 0.5}
 SHORT = {
     # Laws that few or short runs hardly show.
     "links that are held": (PUSH_SUM, {"filter.links": "held", "horizon": 20.0}),
+    "delays of links that are held": (
+        PUSH_SUM,
+        {"filter.links": "held", "horizon": 20.0, "network.channel.delay": LONG},
+    ),
     "rare bursts": (INTERMITTENT, {"network.channel.loss": RARE}),
     "gaps that vary widely": (RING, {"network.activation": HEAVY}),
     "seldom": (RING, {"network.activation": {"kind": "poisson", "rate": 1e-3}}),

@@ -122,6 +122,24 @@ def test_nothing_is_received_as_nothing(scenario_of):
     np.testing.assert_allclose(netkf.simulate(scenario).P, netkf.simulate(plain).P, rtol=1e-4)
 
 
+def test_zeros_but_for_rounding_are_received_as_zeros_in_both_engines():
+    """Information about states that no reading shows is 0 in one engine, and 1e-17 in the other."""
+    quantisation, random = Quantisation(bits=3, range=1.0), np.random.default_rng(1)
+    received, _ = quantisation.apply(np.array([0.0, 1e-17, -1e-12, 1e-3]), random)
+    assert (received == 0.0).tolist() == [True, True, True, False]
+    scenario = netkf.load(SCENARIOS / "nonlinear" / "range_tracking.toml").replace(
+        {
+            "horizon": 15.0,
+            "filter": {"kind": "belief-propagation"},
+            "plant.schedule": [{"from": 1.0, "F": (0.8 * np.eye(4)).tolist()}],
+            "network.quantise": {"bits": 3, "range": 1.0},
+        }
+    )
+    one, other = (netkf.simulate(scenario, engine=name) for name in ("simpy", "compiled"))
+    np.testing.assert_allclose(one.xhat, other.xhat, atol=1e-9)
+    np.testing.assert_allclose(one.P, other.P, atol=1e-9)
+
+
 def plain_run(slots, bits, limit, seed, drive=0.0):
     """Estimates (T, 3) of the filter with a constant gain whose nodes hear quantised estimates; the
     state is z <- 0.9 z + drive from z = 2, without noise.

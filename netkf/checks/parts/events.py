@@ -292,6 +292,11 @@ def delay_counts(scenario: Scenario, messages: np.ndarray) -> DelayCounts | None
     second = np.array([i > j for i, j in losses.links]) & (losses.opposite >= 0) & losses.shared
     direction = _directions(scenario, messages)
     followed = (messages["outcome"] != LOST) & ~second[direction]
+    if not _redraws_links(scenario):
+        # All messages of a held link in one phase of a slot have one delay: the first has it.
+        slots = scenario.slot_plant.slots_of(messages["sent"])
+        keys = np.stack([direction, messages["phase"], slots])
+        followed[1:] &= (keys[:, 1:] != keys[:, :-1]).any(axis=0)
     ages = np.nan_to_num(messages["age"][followed], nan=np.inf)
     sent, direction, size = messages["sent"][followed], direction[followed], len(losses.links)
     return count_delays(law, sent, ages, direction, size, scenario.horizon)
