@@ -14,7 +14,8 @@ from netkf.logs.packet_tables import read_tables
 from netkf.logs.packets import HOLE, PacketLog
 from netkf.logs.recorded_network import Files, write_network
 from netkf.logs.ulb import read_ulb
-from netkf.runs.files import copy_file, make_directory, write_text
+from netkf.runs.directory_lock import lock_directory
+from netkf.runs.files import copy_file, write_text
 from netkf.scenario.reading import load
 
 DATA_SETS: Mapping[str, Callable[[Path], PacketLog]] = {"ulb": read_ulb, "mercator": read_mercator}
@@ -73,19 +74,22 @@ def import_log(
         packets = read_tables(log, columns or {}) if kind == "csv" else DATA_SETS[kind](log)
         files, notes = write_network(packets, name, hole, unreported, scenario)
     paths = [folder / name for name in sorted(files, key="scenario.toml".__ne__)]
-    for path in paths:
-        if path.exists():
-            rule = "is there already, and nothing is overwritten"
-            raise ScenarioError(str(path), rule, None, "choose another folder or remove it")
     write_folder(folder, files)
     return tuple(paths), notes
 
 
 def write_folder(folder: Path, files: Files) -> None:
-    """Write texts, and copy files, by name into a folder. Raises WriteError."""
-    make_directory(folder)
-    for name, content in files.items():
-        if isinstance(content, str):
-            write_text(folder / name, content)
-        else:
-            copy_file(content, folder / name)
+    """Write texts, and copy files, by name into a folder, one command at a time. Raises WriteError,
+    and ScenarioError for what would be overwritten.
+    """
+    with lock_directory(folder):
+        for name in sorted(files, key="scenario.toml".__ne__):
+            if (folder / name).exists():
+                rule = "is there already, and nothing is overwritten"
+                remedy = "choose another folder or remove it"
+                raise ScenarioError(str(folder / name), rule, None, remedy)
+        for name, content in files.items():
+            if isinstance(content, str):
+                write_text(folder / name, content)
+            else:
+                copy_file(content, folder / name)

@@ -11,6 +11,7 @@ import pytest
 
 import netkf
 from netkf.cli.main import main
+from netkf.logs.importing import write_folder
 from netkf.runs.directory_lock import lock_directory
 
 RING = str(Path(__file__).parents[2] / "scenarios" / "poisson_ring.toml")
@@ -41,6 +42,14 @@ COMMANDS = [
     ["check", RING, "--set", "horizon=1.0", "--runs", "10", "--workers", "1"],
     ["sweep", RING, "--set", "horizon=1.0", "--vary", "filter.epsilon=0.1,0.2"],
 ]
+
+
+def test_folders_of_imports_and_exports_are_written_by_one_command(holder):
+    """Two imports at once passed the check that nothing is overwritten together."""
+    out, _ = holder
+    with pytest.raises(netkf.ScenarioError, match="another netkf command writes there"):
+        write_folder(out, {"outcomes.csv": "t\n"})
+    assert not list(out.iterdir())
 
 
 def test_the_second_command_on_a_directory_ends_with_one_line(holder, capsys):
