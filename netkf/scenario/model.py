@@ -714,6 +714,22 @@ class ScenarioModel(Component):
             frames=frames,
         )  # fmt: skip
 
+    def messages_of_slot(self, link: Link) -> list[tuple[float, Transmission]]:
+        """Return the share of each exchange in the messages of a slot, and such a message, on a
+        link; under clocks one.
+        """
+        first, radio, timing = self.transmission(link), self.network.radio, self.node_filter.timing
+        if radio is None or not self.slotted:
+            return [(1.0, first)]
+        sender, reads = link[0], bool(self.placed_sensors.get(link[0]))
+        phases = range((timing.schedule or ()).count("exchange"))
+        steps = {phase: timing.steps(phase) for phase in phases if timing.sends(phase, reads)}
+        found, total = [], sum(steps.values())
+        for phase, count in steps.items() if total else ():
+            size = self.message_size(sender, phase)
+            found.append((count / total, first._replace(size=size, frames=radio.frames(size))))
+        return found or [(1.0, first)]
+
     @cached_property
     def _hearers(self) -> dict[int, tuple[int, ...]]:
         found: dict[int, list[int]] = {}
@@ -771,8 +787,11 @@ class ScenarioModel(Component):
         if self.topology.radius is not None or self.network_changes:
             return math.nan
         if link not in self._mean_deliveries:
-            mean = self.network.channel.mean_delivery(self.transmission(link), self.horizon)
-            self._mean_deliveries[link] = mean
+            channel = self.network.channel
+            self._mean_deliveries[link] = sum(
+                share * channel.mean_delivery(sent, self.horizon)
+                for share, sent in self.messages_of_slot(link)
+            )
         return self._mean_deliveries[link]
 
     @cached_property

@@ -177,6 +177,20 @@ def test_each_exchange_of_a_slot_has_messages_of_its_own_size(scenario_of, engin
     assert_agree(scenario.replace(lossy))
 
 
+def test_messages_of_a_slot_in_several_frames_arrive_as_often_as_is_stated():
+    """Three frames of the first exchange, one of each of the next three: .7^3 and .7."""
+    planar = netkf.load(SCENARIOS / "push_sum_planar.toml")
+    scenario = planar.replace({"network.radio": {"frame_bytes": 32}, "horizon": 10.0})
+    stated = 0.25 * 0.7**3 + 0.75 * 0.7
+    link = scenario.topology.directions[0]
+    assert scenario.mean_delivery(link) == pytest.approx(stated)
+    run = netkf.simulate(scenario)
+    sent, heard = (int((run.log["kind"] == CODES[kind]).sum()) for kind in ("send", "deliver"))
+    assert abs(heard / sent - stated) < 5.0 * np.sqrt(0.25 / sent)
+    rows = netkf.check(scenario, runs=10).rows
+    assert not [row.promise for row in rows if row.verdict == "broken"]
+
+
 @pytest.mark.parametrize("engine", ["simpy", "compiled"])
 def test_a_radio_is_free_at_the_instant_at_which_a_message_ends(scenario_of, engine):
     clock = {"kind": "periodic", "period": 0.1, "at": "nodes"}

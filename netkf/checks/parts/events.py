@@ -149,7 +149,8 @@ def loss_law(scenario: Scenario) -> LossLaw:
     loss, links = stated_part(channel.loss, "loss"), scenario.topology.directions
     stated = dataclasses.replace(channel, loss=loss)
     delivery = [
-        stated.mean_delivery(scenario.transmission(link), scenario.horizon) for link in links
+        sum(share * stated.mean_delivery(sent, scenario.horizon) for share, sent in messages)
+        for messages in map(scenario.messages_of_slot, links)
     ]
     at_once = getattr(clock, "at", "links") == "links"
     senders, receivers = np.array(links, dtype=np.int64).reshape(-1, 2).T

@@ -288,7 +288,7 @@ def loss_assumptions(scenario: Scenario) -> list[Assumption]:
         drawn, why = False, "a table lists the links that are up; others lose their messages"
     source, name = "the scenario", f"the loss {name_of('loss', channel.loss)!r}"
     stated = bool(np.isfinite(law.lost).all())
-    changes = "" if law.steady else f"{name} changes it with the message"
+    changes = "" if law.steady else f"{name}, or the number of frames, changes it with the message"
     return [
         Assumption(DRAWN, source, drawn, why),
         Assumption(STATED, source, stated, "for each link" if stated else f"{name} does not"),

@@ -240,14 +240,17 @@ def arrival_of(scenario: Scenario, direction: tuple[int, int]) -> float:
 @lru_cache(maxsize=8)
 def has_constant_losses(scenario: Scenario) -> bool:
     """Return True if all messages of a link arrive with one probability; a class is asked."""
-    loss = scenario.network.channel.loss
+    loss, directions = scenario.network.channel.loss, scenario.topology.directions
+    for direction in directions if scenario.network.radio is not None else ():
+        if len({sent.frames for _, sent in scenario.messages_of_slot(direction)}) > 1:
+            return False
     if identical_per_link(loss) or isinstance(loss, GilbertElliott):
         return scenario.network.channel.channels is None
     if has_conditions(loss) or scenario.network.channel.channels is not None:
         return False
     return all(
         has_one_probability(loss, scenario.transmission(direction), scenario.horizon)
-        for direction in scenario.topology.directions
+        for direction in directions
     )
 
 
