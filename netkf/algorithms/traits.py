@@ -227,6 +227,11 @@ class Timing:
     stopping: int = -1
 
     @property
+    def exchanges(self) -> int:
+        """The number of exchanges of a slot, without their repetitions; 0 for filters without."""
+        return (self.schedule or ()).count("exchange")
+
+    @property
     def first_exchange(self) -> int:
         """The first slot with an exchange: ``first_slot``, by default 0 for filters that predict
         and broadcast, else 1, because slot 0 has no reading.

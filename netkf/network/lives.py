@@ -8,7 +8,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -55,11 +55,13 @@ class Life(Component):
             the covariance of its filter, in slots when the next one begins
     """
 
-    _change_rate: ClassVar[float] = 0.0
-    """Changes of a node in a second, in the mean; 0 where it is not known."""
-
     nodes: tuple[int, ...] = field(list_of(node_id(), "node ids"))
     memory: str = field(one_of("kept", "lost"), default="kept")
+
+    @property
+    def _change_rate(self) -> float:
+        """Changes of a node in a second, in the mean; 0 where it is not known."""
+        return 0.0
 
     @abstractmethod
     def changes(
@@ -85,7 +87,7 @@ class Crashes(Life):
     mean_down: float = field(positive)
 
     @property
-    def _change_rate(self) -> float:  # type: ignore[override]
+    def _change_rate(self) -> float:
         return 2.0 / (self.mean_up + self.mean_down)
 
     def changes(
@@ -110,7 +112,7 @@ class DutyCycle(Life):
     phase: float = field(of_time(number(low=0.0)), default=0.0)
 
     @property
-    def _change_rate(self) -> float:  # type: ignore[override]
+    def _change_rate(self) -> float:
         return 2.0 / self.period
 
     def __post_init__(self) -> None:

@@ -27,8 +27,7 @@ class Quantisation(Component):
     Both ends know a dither u, uniform over a step of ``2 range / 2^bits``: the sender rounds z + u,
     the receiver subtracts u. Up to half a step below ``range`` nothing is clipped: the error is
     uniform over a step, whatever z is, and independent of it and of other errors (Roberts 1962;
-    Schuchman 1964). Zeros, also those that rounding makes of 0, are received
-    as 0.
+    Schuchman 1964). Zeros, also those that rounding makes of 0, are received as 0.
     """
 
     bits: int = field(integer(low=1, high=MAX_BITS))

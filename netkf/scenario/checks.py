@@ -523,7 +523,7 @@ def _check_slots(scenario: DerivedScenario) -> None:
             given,
             "choose another activation or another filter",
         )
-    exchanges = (node_filter.timing.schedule or ()).count("exchange")
+    exchanges = node_filter.timing.exchanges
     if exchanges * scenario.phase_length >= plant.period * (1.0 - 1e-9):
         rule = f"must leave {exchanges} exchange(s) room within the period {plant.period:g}"
         remedy = "shorten it; the steps of an exchange share it"

@@ -357,8 +357,13 @@ class DerivedScenario(ScenarioModel):
         """The input u (S, m) of a nonlinear plant in all slots, as the filters know it."""
         plant = self.slot_plant
         assert isinstance(plant, NonlinearPlant)
-        u = plant.inputs(int(self.horizon / plant.period) + 2)
-        return u if plant.input is None else u * plant.input.known_to(self.filter.model)
+        return plant.inputs(int(self.horizon / plant.period) + 2) * self._known_inputs
+
+    @property
+    def _known_inputs(self) -> FloatArray:
+        """1 for each component of the input that filters know, else 0, (m,)."""
+        u = self.plant.input
+        return np.zeros(0) if u is None else u.known_to(self.filter.model)
 
     @cached_property
     def node_infos(self) -> tuple[NodeInfo, ...]:
@@ -878,9 +883,7 @@ class DerivedScenario(ScenarioModel):
                 changes = (np.diff(values[:, inputs], axis=0) != 0.0).any(axis=1)
                 jumps = np.append(True, changes)
                 times, values = times[jumps], values[jumps]
-            known = np.zeros(0)
-            if plant.input is not None:
-                known = plant.input.known_to(self.filter.model)[inputs]
+            known = self._known_inputs[inputs]
             amplitudes = np.stack([known, np.ones_like(known), np.ones_like(known)])
             return RateModel(
                 A, noises[0], H, R, self.horizon, self.horizon, f=f, jacobian=jacobian,

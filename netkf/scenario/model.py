@@ -639,8 +639,7 @@ class ScenarioModel(Component):
         assert isinstance(activation, SlotActivation)
         if activation.phase is not None:
             return activation.phase
-        exchanges = (self.node_filter.timing.schedule or ()).count("exchange")
-        return 0.5 * self.slot_plant.period / max(1, exchanges)
+        return 0.5 * self.slot_plant.period / max(1, self.node_filter.timing.exchanges)
 
     @cached_property
     def placed_sensors(self) -> dict[int, tuple[PlacedSensor, ...]]:
@@ -721,9 +720,9 @@ class ScenarioModel(Component):
         first, radio, timing = self.transmission(link), self.network.radio, self.node_filter.timing
         if radio is None or not self.slotted:
             return [(1.0, first)]
-        sender, reads = link[0], bool(self.placed_sensors.get(link[0]))
-        phases = range((timing.schedule or ()).count("exchange"))
-        steps = {phase: timing.steps(phase) for phase in phases if timing.sends(phase, reads)}
+        sender, reads = link[0], link[0] in self.placed_sensors
+        sending = (phase for phase in range(timing.exchanges) if timing.sends(phase, reads))
+        steps = {phase: timing.steps(phase) for phase in sending}
         found, total = [], sum(steps.values())
         for phase, count in steps.items() if total else ():
             size = self.message_size(sender, phase)
@@ -773,7 +772,7 @@ class ScenarioModel(Component):
             return longest
         if radio.queue == "wait":
             return math.inf
-        phases = range((self.node_filter.timing.schedule or ()).count("exchange"))
+        phases = range(self.node_filter.timing.exchanges)
         sizes = (
             self.message_size(node, phase)
             for node in self.nodes

@@ -133,7 +133,7 @@ def _check_exchanges(scenario: DerivedScenario) -> None:
     if not isinstance(activation, RecordedSlots) or activation.matching:
         return
     # The schedule lists the phases of a slot; ``recorded`` counts only the exchanges among them.
-    phases = (node_filter.timing.schedule or ()).count("exchange")
+    phases = node_filter.timing.exchanges
     for slot, phase, step in activation.recorded:
         steps = node_filter.timing.steps(phase) if phase < phases else 0
         if step >= steps:

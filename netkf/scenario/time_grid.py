@@ -147,7 +147,7 @@ def _step_lengths(scenario: Any) -> Iterator[TimeConstant]:
         return
     length = scenario.phase_length
     exact = as_fraction(length)
-    for phase in range((node_filter.timing.schedule or ()).count("exchange")):
+    for phase in range(node_filter.timing.exchanges):
         steps = node_filter.timing.steps(phase)
         if steps:
             share = None if exact is None else exact / steps

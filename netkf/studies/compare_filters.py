@@ -286,9 +286,8 @@ def _meet_same_losses(scenario: Scenario, other: Scenario) -> bool:
     if is_ideal or not scenario.slotted:
         return True
     first, second = (
-        (one.timing.first_exchange, [one.timing.steps(k) for k in range(phases)])
+        (one.timing.first_exchange, [one.timing.steps(k) for k in range(one.timing.exchanges)])
         for one in filters
-        for phases in [(one.timing.schedule or ()).count("exchange")]
     )
     return first == second
 

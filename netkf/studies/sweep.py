@@ -237,7 +237,7 @@ def sweep_to_directory(
         completed = CompletedSweep(directory, pd.DataFrame(rows), tuple(plan.vary), seconds)
         if take is not None:
             take(completed)
-        _write_rows(directory, rows)
+        _write_table(directory, completed.table)
         is_written = True
         if finish is not None:
             finish(completed)
@@ -250,16 +250,13 @@ def sweep_to_directory(
         raise
     finally:
         if rows and not is_written:
-            _write_rows(directory, rows)
+            _write_table(directory, pd.DataFrame(rows))
         _write_manifest(directory, plan, len(rows), status)
     return completed
 
 
-def _write_rows(directory: Path, rows: Sequence[Row]) -> None:
+def _write_table(directory: Path, table: pd.DataFrame) -> None:
     """Write sweep.parquet and sweep.csv."""
-    import pandas as pd
-
-    table = pd.DataFrame(rows)
     write_table(directory / "sweep.parquet", {str(name): table[name] for name in table})
     write_text(directory / "sweep.csv", table.to_csv(index=False))
 

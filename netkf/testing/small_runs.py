@@ -229,6 +229,6 @@ def _activation(kind: Kind, timing: Timing, tick: float) -> LinkClock | SlotActi
 def _delay(kind: Kind, timing: Timing, tick: float) -> Delay:
     if not kind.slots:
         return Unreliable(RELIABLE, 0.7 * tick)
-    steps = [timing.steps(phase) for phase in range((timing.schedule or ()).count("exchange"))]
+    steps = [timing.steps(phase) for phase in range(timing.exchanges)]
     # All messages of the last slot are lost.
     return Unreliable((kind.slots - 1 - timing.first_exchange) * sum(steps), 0.0)

@@ -189,7 +189,7 @@ def _redraws_links(scenario: Scenario) -> bool:
     filter_ = scenario.node_filter
     if not scenario.slotted:
         return True
-    phases = range((filter_.timing.schedule or ()).count("exchange"))
+    phases = range(filter_.timing.exchanges)
     steps = [(phase, k) for phase in phases for k in range(filter_.timing.steps(phase))]
     return all(filter_.timing.redraws(*step) for step in steps)
 

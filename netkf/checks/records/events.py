@@ -318,7 +318,7 @@ def _sent_in_slots(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
 
 def _sent_in_rounds(scenario: Scenario, log: Any) -> Iterator[str]:
     algorithm, kinds = scenario.node_filter, log["kind"]
-    phases = range((algorithm.timing.schedule or ()).count("exchange"))
+    phases = range(algorithm.timing.exchanges)
     steps = [algorithm.timing.steps(phase) for phase in phases]
     rounds = log["phase"][kinds == ROUND]
     slots = _slots(scenario) - algorithm.timing.first_exchange
