@@ -220,16 +220,16 @@ class CentralModel:
 def _require_central(scenario: Scenario) -> None:
     plant, leave_out = scenario.plant, "leave it out"
     increments = "must take samples: increments have no density of their own"
-    changes = "cannot be here: the noise of one model is fitted"
-    linear = "must be linear, as the Kalman filter whose likelihood is fitted"
+    changes = "cannot be here: the likelihood is that of one model"
+    linear = "must be linear, as the Kalman filter whose likelihood this is"
     lives = "cannot be here: the likelihood is that of all readings, also of nodes that are down"
     clocks = "cannot be here: the likelihood is that of readings with right stamps"
-    unknown = "must be true: an input that the model does not have would be fitted as noise"
+    unknown = "must be true: an input that the model does not have would count as noise"
     for wrong, key, rule, remedy in (
         (not plant.linear, "plant", linear, "write a linear plant that is close to it"),
         (not scenario.has_linear_sensors, "sensors", linear, "leave the others out"),
         (scenario.increment_sensors, "sensors", increments, "write sampling = { kind = ... }"),
-        (len(plant.changes), "plant.schedule", changes, "fit each part of the run by itself"),
+        (len(plant.changes), "plant.schedule", changes, "take each part of the run by itself"),
         (scenario.network.lives, "network.lives", lives, leave_out),
         (scenario.network.clocks, "network.clocks", clocks, leave_out),
         (scenario.misses_input, "filter.model.input", unknown, leave_out),

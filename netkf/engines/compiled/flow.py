@@ -14,6 +14,7 @@ import numpy as np
 
 from netkf.algorithms.filter import compiled_kernels
 from netkf.algorithms.kernels.root_flow import FlowScratch
+from netkf.algorithms.traits import CLOCKS
 from netkf.core.interrupts import defer_signals
 from netkf.engines.base import Progress
 from netkf.engines.compiled.agenda import is_immediate, simulate_single_run
@@ -37,7 +38,6 @@ from netkf.engines.compiled.sample_tables import samples_of
 from netkf.engines.compiled.samples import by_node, entries_of, record_samples
 from netkf.engines.compiled.senders import senders_of
 from netkf.engines.compiled.state import (
-    CLOCKS,
     Instants,
     PathBlock,
     SampleBuffer,

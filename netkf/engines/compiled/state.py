@@ -65,8 +65,7 @@ sent, arrival : seconds
 
 NOBODY = -2  # the number of a block that nobody estimates
 LINKS, DIRECTIONS, NODES, AFTER_READINGS = range(4)
-CLOCKS = ("links", "directions", "nodes", "readings")
-"""The values of ``Senders.at`` in the order of these constants. From NODES on nodes broadcast: one
+"""The values of ``Senders.at`` in the order of traits.CLOCKS. From NODES on nodes broadcast: one
 transmission to all receivers.
 """
 
@@ -226,7 +225,7 @@ class Simulation(Struct):
     xhat, root : (G N, n) and (G N, n, n)
     now : time (G N,) in seconds, by the node's clock, that each estimate refers to
     table, gains : tables of all models, the last without sensors, for messages under way
-    clock_kind : kind of its clocks, an index in CLOCKS
+    clock_kind : kind of its clocks, LINKS, DIRECTIONS, NODES or AFTER_READINGS
 
     Links and messages
 
