@@ -36,7 +36,7 @@ def nees_figure(data: FigureData) -> style.Picture:
     inside = float(((values >= low) & (values <= high))[known].mean())
     divisor = f" over {data.runs:,} runs" if data.runs > 1 else ""
     freedom = " and ".join(f"{data.runs * size:,}" for size in sorted(set(sizes)))
-    note = f"Band: chi-square with {freedom} degrees of freedom{divisor}."
+    note = f"Band: chi-square with {freedom} degree{'s' * (freedom != '1')} of freedom{divisor}."
     note += f" Errors of {data.scenario.states_note}." * bool(data.scenario.states_note)
     headline = f"{inside:.0%} of the samples lie in the {CONFIDENCE:.0%} band of NEES; their mean "
     mean = float((values / unit)[known].mean())

@@ -9,6 +9,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.collections import LineCollection
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from netkf.figures.figure_data import FigureData
@@ -130,7 +131,8 @@ def draw_network(
         left, below = (
             at_rim and p < m - 1e-9 for p, m in zip(positions[node], middle, strict=True)
         )
-        style: dict[str, Any] = {"fontsize": 6.5, "color": MUTED, "zorder": 3}
+        style: dict[str, Any] = {"fontsize": 6.5, "color": INK, "zorder": 3}
+        style["path_effects"] = [withStroke(linewidth=1.5, foreground="white", alpha=0.8)]
         style |= {"ha": "right" if left else "left", "va": "top" if below else "baseline"}
         offset = (-distance if left else distance, -distance if below else distance)
         axes.annotate(
@@ -202,8 +204,10 @@ def _draw_nodes(
             edgecolors=INK,
             linewidths=0.5,
             zorder=2,
-            label=label,
             plotnonfinite=True,
             clip_on=False,  # an equal aspect may leave a marker at the rim no room
         )
+        # The legend is about shapes: a colour in it would be that of the first node.
+        legend: dict[str, Any] = {"mfc": "white", "mec": INK, "mew": 0.5, "label": label}
+        axes.plot([], [], marker, ms=math.sqrt(_dot_area(data)), **legend)
     return dots if finite else None

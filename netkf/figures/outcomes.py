@@ -139,8 +139,9 @@ def losses_figure(data: FigureData) -> Picture:
     bar.outline.set_linewidth(0.5)
     worst = used[int(np.argmax(lost[used] / sent[used]))]
     headline = f"{(~outcomes.heard).mean():.1%} of the messages were lost"
-    window = f"{edges[worst]:.6g} and {edges[worst + 1]:.6g} s"
-    headline += f"; at worst {lost[worst] / sent[worst]:.0%}, between {window}"
+    if lost[worst]:
+        window = f"{edges[worst]:.6g} and {edges[worst + 1]:.6g} s"
+        headline += f"; at worst {lost[worst] / sent[worst]:.0%}, between {window}"
     note = f"In parts of {edges[1]:.5g} s, by the time of sending; white: nothing was sent."
     return finish_figure(figure, data.title(headline), data.caption(note))
 

@@ -267,7 +267,8 @@ def law_figure(data: FigureData) -> Picture:
             f"Mean trace of P {run_mean:.3g} in the run; the invariant law has "
             f"{law_traces.mean():.3g}"
         )
-    positive = traces[np.isfinite(traces) & (traces > 0.0)]
+    drawn = np.concatenate([traces.ravel(), [] if law_traces is None else law_traces])
+    positive = drawn[np.isfinite(drawn) & (drawn > 0.0)]
     if positive.size:
         low, high = positive.min(), positive.max()
         if high > LOG_RATIO * low:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import bisect
 import contextlib
 import io
+import re
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -63,6 +64,7 @@ POINTS_PER_INCH = 72.0
 SECONDS = "simulated seconds"
 TITLE_SIZE, CAPTION_SIZE, LEGEND_SIZE = 10.5, 7.5, 7.5
 """Font sizes in points."""
+UNIT = re.compile(r"(?<=\d) (?=s\b)")
 _is_styled: list[bool] = []
 
 
@@ -114,7 +116,8 @@ def break_lines(text: str, width: float, size: float, weight: str = "normal") ->
     """Return a text in lines of at most ``width`` points in a font of ``size`` points, without
     control characters, and with escaped dollar signs, which matplotlib takes for formulas.
     """
-    words, pieces = one_line(text).split(), list[str]()
+    # A unit stays with its number.
+    words, pieces = UNIT.sub("\xa0", one_line(text)).split(" "), list[str]()
     while words:
         # As many words as one line takes, at least one.
         count = 1 + bisect.bisect_right(
@@ -124,7 +127,7 @@ def break_lines(text: str, width: float, size: float, weight: str = "normal") ->
         )
         pieces += _split_word(" ".join(words[:count]), width, size, weight)
         words = words[count:]
-    return "\n".join(pieces).replace("$", r"\$")
+    return "\n".join(pieces).replace("\xa0", " ").replace("$", r"\$")
 
 
 def _split_word(line: str, width: float, size: float, weight: str) -> list[str]:

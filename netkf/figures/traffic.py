@@ -103,10 +103,11 @@ def age_of_information(arrived: np.ndarray, node: int, end: float) -> AgeSawtoot
 def age_figure(data: FigureData) -> Picture:
     """Draw the age of information over time and its distribution; raises UnavailableError."""
     end = _last_time(data)
-    degrees = data.scenario.topology.degrees
-    receivers = [node for node in data.nodes if degrees.get(node, 0)]
+    # A node to which nothing is sent, such as one among nodes without readings, does not wait.
+    addressed = set(rows_of(data.log, "send")["peer"].tolist())
+    receivers = [node for node in data.nodes if node in addressed]
     if not receivers:
-        raise UnavailableError("No node can hear another one.")
+        raise UnavailableError("Nothing was sent to any node.")
     arrived = rows_of(data.log, "deliver")
     ages = [age_of_information(arrived, node, end) for node in receivers]
     means = np.array([float(age.mean(np.array([0.0, end]))[0]) for age in ages])

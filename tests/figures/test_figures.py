@@ -97,6 +97,7 @@ SAYS = [
     ("ring", "nis", "NIS per row of a reading is"),
     ("ensemble", "age", "Only single runs have events"),
     ("slots", "stability", "There is no map of Tanwani's bound H(12)"),
+    ("one node", "nees", "with 1 degree of freedom."),
 ]
 
 
@@ -427,6 +428,21 @@ def test_equal_values_have_one_colour():
     assert len({value for dots in both for value in dots.get_array()}) == 1
     assert len({tuple(color) for dots in both for color in dots.get_facecolors()}) == 1
     assert not any(dots.get_clip_on() for dots in both)  # whole at the rim of their panel
+
+
+def test_the_legend_of_a_network_has_no_colour_of_a_node():
+    figure = netkf.simulate(netkf.load(SCENARIOS / "poisson_ring.toml")).plot("network")
+    legend = next(axes.get_legend() for axes in figure.axes if axes.get_legend())
+    assert [line.get_markerfacecolor() for line in legend.get_lines()] == ["white", "white"]
+
+
+def test_only_what_happened_stands_in_titles_and_on_axes():
+    """Nobody waits where nothing is sent to it, and the axis has room for the law too."""
+    run = netkf.simulate(netkf.load(SCENARIOS / "intermittent_scalar.toml"))
+    assert "waits" not in run.plot("age").get_suptitle()
+    assert run.plot("law").axes[0].get_xscale() == "log"
+    ring = netkf.load(SCENARIOS / "gossip_ring.toml", {"horizon": 20.0})
+    assert netkf.simulate(ring).plot("losses").get_suptitle().endswith("messages were lost")
 
 
 def test_nodes_of_a_matrix_that_have_labels_are_equally_far_apart():

@@ -108,6 +108,13 @@ def test_lines_are_no_wider_than_asked(width):
         assert "".join(lines).replace(" ", "") == text.replace(" ", "")
 
 
+def test_a_unit_stays_with_its_number():
+    lines = break_lines(
+        "node 3 waits longest, 517 s", text_width("node 3 waits longest, 517", 9.0), 9.0
+    )
+    assert lines == "node 3 waits longest,\n517 s"
+
+
 def test_names_are_no_formulas_and_have_no_control_characters():
     figure = new_figure()
     written = break_lines("costs $5$ \x1b[31m \n and _{x}", 300.0, 9.0)
