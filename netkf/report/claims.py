@@ -330,10 +330,9 @@ def _describe_ensemble(source: ReportSource) -> list[str]:
     k = int(np.nanargmax(errors[:-1]))
     rows = {row["node"]: row for row in source.summary.get("nodes", [])}
     error = rows.get(ensemble.nodes[k], {}).get("rms_error_se")
-    interval = f" +- {error:.1g}" if error is not None else ""
     return [
         f"Over {source.runs:,} runs node {ensemble.nodes[k]} was worst: RMS error "
-        f"{format_number(float(errors[k]))}{interval}, the largest of {len(ensemble.nodes)} nodes "
+        f"{format_with_error(float(errors[k]), error)}, the largest of {len(ensemble.nodes)} nodes "
         f"(all nodes {format_number(float(errors[-1]))})"
     ]
 

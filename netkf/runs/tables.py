@@ -36,8 +36,13 @@ def format_number(value: float | None) -> str:
 
 def format_with_error(value: float | None, error: float | None) -> str:
     """Return a value with its standard error, if known, as text: ``1.2 +- 0.1``."""
+    return format_number(value) + format_error(error)
+
+
+def format_error(error: float | None, digits: int = 1) -> str:
+    """Return `` +- 0.1`` with so many significant digits, ten as 10; nothing if it is unknown."""
     known = error is not None and math.isfinite(error)
-    return format_number(value) + (f" +- {error:.1g}" if known else "")
+    return f" +- {float(f'{error:.{digits}g}'):g}" if known else ""
 
 
 def format_table(header: list[str], rows: list[list[str]], left_columns: int = 0) -> str:

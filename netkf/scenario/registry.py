@@ -246,7 +246,7 @@ def _require_part(family: str, kind: str, cls: Any) -> type[Component] | None:
         return None
     base = FAMILIES[family]
     if not (isinstance(cls, type) and issubclass(cls, base)):
-        remedy = f"derive the class from {base.__module__}.{base.__name__}"
+        remedy = f"derive the class from netkf.parts.{base.__name__}"
         raise ScenarioError("kind", f"must be a subclass of netkf's {base.__name__}", kind, remedy)
     missing = sorted(
         name

@@ -28,7 +28,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.runs.files import require_run
 from netkf.runs.simulate import simulate
 from netkf.runs.summary import chi_square_interval
-from netkf.runs.tables import format_number, format_table, shorten_rows
+from netkf.runs.tables import format_error, format_number, format_table, shorten_rows
 from netkf.scenario.scenario import Scenario
 from netkf.studies.likelihood import CentralModel
 from netkf.trace.run import Run
@@ -376,7 +376,7 @@ def format_innovations(tests: InnovationTests, full: bool = True) -> str:
             str(row.node),
             f"{row.readings:,}",
             format_number(row.nis),
-            format_number(row.bias) + f" +- {row.bias_reach:.2g}" * math.isfinite(row.bias_reach),
+            format_number(row.bias) + format_error(row.bias_reach, digits=2),
             *[row.label or f"y{row.component}"] * named,
             format_number(row.p_white),
             f"{row.log_likelihood:.6g}",

@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from netkf.core.printable import count_phrase, shorten
-from netkf.runs.tables import format_number, format_table, format_with_error, shorten_rows
+from netkf.runs.tables import (
+    format_error,
+    format_number,
+    format_table,
+    format_with_error,
+    shorten_rows,
+)
 from netkf.studies.compare import Comparison
 from netkf.studies.compare_filters import ComparedFilter, FilterComparison
 from netkf.studies.consistency import Consistency
@@ -105,7 +111,7 @@ def format_consistency(consistency: Consistency, full: bool = True) -> str:
         [
             str(row.node),
             *[row.block] * of_blocks,
-            format_number(row.nees) + (f" +- {row.width:.1g}" if math.isfinite(row.width) else ""),
+            format_number(row.nees) + format_error(row.width),
             format_number(row.expected),
             f"{row.inside:.0%}" if math.isfinite(row.inside) else "-",
             format_number(row.nis),
@@ -200,9 +206,8 @@ def _is_known(row: ComparedFilter, name: str) -> bool:
 def _format_quantity(cells: Quantity) -> tuple[str, str]:
     difference = "-"
     if math.isfinite(cells.difference):
-        width = 0.5 * (cells.high - cells.low)
         difference = f"{cells.difference:+.4g}"
-        difference += f" +- {width:.2g}" if math.isfinite(width) else ""
+        difference += format_error(0.5 * (cells.high - cells.low), digits=2)
         difference += "*" if cells.real else ""
     return format_with_error(cells.value, cells.se), difference
 

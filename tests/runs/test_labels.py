@@ -6,7 +6,7 @@ import pytest
 import netkf
 from netkf.runs.run import run_to_directory
 from netkf.runs.summary import promise_traces
-from netkf.runs.tables import summary_table
+from netkf.runs.tables import format_with_error, summary_table
 from netkf.theory.promises import compute_promises, promises_text
 from tests.benchmarks.cases import load
 
@@ -158,3 +158,8 @@ def test_a_long_table_lists_the_worst_first():
         row |= {"rms_error": None, "mean_trace": float(row["node"])}
     lines = summary_table({**summary, "bound": "", "messages": messages}).splitlines()[2:33]
     assert [line.split()[0] for line in lines[:2]] == ["39", "38"]
+
+
+def test_intervals_of_ten_and_more_are_plain_numbers():
+    assert format_with_error(478.2, 9.7) == "478.2 +- 10"
+    assert format_with_error(0.031, 0.0012) == "0.031 +- 0.001"
