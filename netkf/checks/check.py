@@ -213,15 +213,14 @@ def run_replica(
 def _error_difference(run: Run, twin: Run) -> float:
     """Return the largest difference between errors of a ``run`` and of its built-in ``twin``."""
     common = min(len(run.times), len(twin.times))
-    size = np.sqrt(np.trace(twin.P[:common], axis1=-2, axis2=-1))[..., None]
+    # Each state in units of its own; of a node with fewer blocks than others the last are nan.
+    size = np.sqrt(np.diagonal(twin.P[:common], axis1=-2, axis2=-1))
     rounding = np.maximum(run.rounding[:common], twin.rounding[:common])[:, None, None]
     # Roundings of errors that were larger at earlier times are still in the estimates.
     earlier = np.maximum.accumulate(np.nan_to_num(np.abs(twin.error[:common])).max(axis=(1, 2)))
     rounding = np.maximum(rounding, OPERATIONS * EPS * earlier[:, None, None])
     gap = np.abs(run.error[:common] - twin.error[:common])
-    comparable = np.broadcast_to(
-        (rounding <= 0.1 * TWIN_TOLERANCE * size) & (size > 0.0), gap.shape
-    )
+    comparable = (rounding <= 0.1 * TWIN_TOLERANCE * size) & (size > 0.0)
     relative_gap = gap / np.where(size > 0.0, size, 1.0)
     if not comparable.any():
         return math.nan

@@ -355,15 +355,12 @@ def check_bias(samples: RunSamples, level: float) -> Finding:
     if not len(bias) or not np.abs(bias).any():
         return find_nothing(BIAS_TOLERANCE)
     information, vector = bias[:, :, :n].sum(axis=0), bias[:, :, n].sum(axis=0)
-    values, vectors = np.linalg.eigh(information)
-    varying = values > 1e-10 * values[-1]
     # z is standard normal without a bias, and the whitened estimate of the bias is spread @ z.
-    z = (vectors.T @ vector)[varying] / np.sqrt(values[varying])
+    factor = whiten(information, MIN_VARIANCE_SHARE).factor
+    z = factor @ vector
     covariances = Sigma.reshape(-1, n, n)
     typical = covariances[np.isfinite(covariances).all(axis=(1, 2))].mean(axis=0)
-    spread = whiten(typical, MIN_VARIANCE_SHARE).factor @ (
-        vectors[:, varying] / np.sqrt(values[varying])
-    )
+    spread = whiten(typical, MIN_VARIANCE_SHARE).factor @ factor.T
     length = _length_interval(spread, z, level)
     message = "bias that all errors share, in standard deviations of an error,"
     finding = find_largest([(length, "all nodes and times")], BIAS_TOLERANCE, message)

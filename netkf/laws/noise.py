@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from netkf.laws.intervals import (
     NO_COMPARISON,
@@ -29,6 +30,8 @@ from netkf.linalg.arrays import FloatArray, symmetric
 
 MIN_VARIANCE_SHARE = 1e-10
 """Share of the largest variance below which a direction has no noise."""
+VISIBLE = 1e-5
+"""Largest rounding error of noise, in standard deviations, that leaves it visible."""
 LAGS, PARTS = (2, 3, 4), 4
 """Lags of the autocorrelation of each entry beside 1, and equal parts of a series in which the
 pooled variance is tested.
@@ -62,7 +65,7 @@ class Whitening(NamedTuple):
     """Factors of a covariance S (n, n) of rank r.
 
     factor     : (r, n), W with W S W' = 1: it turns noise of covariance S into standard white noise
-    null_space : (n - r, n), orthonormal rows: the directions in which S has no noise
+    null_space : (n - r, n), rows that are orthonormal in units of S: directions without noise
     """
 
     factor: FloatArray
@@ -70,11 +73,23 @@ class Whitening(NamedTuple):
 
 
 def whiten(S: FloatArray, share: float = 1e-12) -> Whitening:
-    """Return whitening factors of ``S`` without directions below a ``share`` of the largest."""
-    values, vectors = np.linalg.eigh(symmetric(S))
+    """Return whitening factors of ``S`` without directions below a ``share`` of the largest, in
+    units of its rows.
+    """
+    sizes = np.diagonal(S)
+    units = np.sqrt(np.where(sizes > 0.0, sizes, 1.0))
+    values, vectors = np.linalg.eigh(symmetric(S) / units[:, None] / units)
     positive = values > share * max(float(values[-1]), np.finfo(float).tiny)
-    factor = (vectors[:, positive] / np.sqrt(values[positive])).T
-    return Whitening(np.asarray(factor), vectors[:, ~positive].T)
+    factor = (vectors[:, positive] / np.sqrt(values[positive])).T / units
+    return Whitening(np.asarray(factor), vectors[:, ~positive].T / units)
+
+
+def is_visible(factor: FloatArray, sizes: FloatArray) -> NDArray[np.bool_]:
+    """Return a mask (..., r) of the rows of a whitening ``factor`` (..., r, n) that leave noise of
+    differences of numbers of ``sizes`` (..., n), and not mostly rounding; True for rows of nan.
+    """
+    rounding = (np.abs(factor) @ sizes[..., None])[..., 0] * np.finfo(float).eps
+    return np.asarray(~(rounding >= VISIBLE))
 
 
 def transition_law(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
@@ -250,7 +265,7 @@ def compare_sides(e: FloatArray, others: FloatArray, level: float) -> Iterator[L
     """Compare mean and variance of noise ``e`` (N, q) where each of the numbers ``others`` (N, r)
     is above its median with those where it is below: noise that does not depend on them has none.
     """
-    varies = others.std(axis=0) > NEGLIGIBLE * (1.0 + np.abs(others).max(axis=0, initial=0.0))
+    varies = others.std(axis=0) > NEGLIGIBLE * np.abs(others).max(axis=0, initial=0.0)
     sides = np.sign(others[:, varies] - np.median(others[:, varies], axis=0))
     labels = [f"that component {k} is above its median" for k in np.flatnonzero(varies)]
     for moment, values in (("mean", e), ("variance", e**2 - (e**2).mean(axis=0))):

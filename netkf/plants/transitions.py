@@ -8,9 +8,9 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import apply, gauss_legendre, norm, product
-from netkf.linalg.spectra import growth_factor, growth_rate
+from netkf.linalg.spectra import balanced_norm, growth_factor, growth_rate
 
-UNIT_SIZE = 0.5  # largest norm of A times a gap for which one power series is used
+UNIT_SIZE = 0.5  # largest balanced norm of A times a gap for which one power series is used
 DEPENDENT = 1e-9  # a remainder below this share of the row's norm counts as rounding
 _NODES, _WEIGHTS = gauss_legendre(10)  # exact to rounding for gaps of that size
 
@@ -28,14 +28,16 @@ class Transitions:
 
     def __init__(self, A: FloatArray, B: FloatArray) -> None:
         self.n = len(A)
-        self._norm = float(np.abs(A).sum(axis=0).max())
+        # In units of the states in which entries are alike: each doubling doubles the rounding.
+        self._norm = balanced_norm(A)
+        longest = A * (UNIT_SIZE / self._norm) if self._norm > 0.0 else A
         powers = [np.eye(self.n)]
-        # The terms A^k / k! that matter for gaps with |A| g <= UNIT_SIZE.
-        term, k = 1.0, 1
-        while term > 1e-19:
-            term *= UNIT_SIZE / k
-            powers.append(product(powers[-1], A) / k)
-            k += 1
+        term = total = powers[0]
+        # The terms A^k / k! that matter to any entry for gaps with |A| g <= UNIT_SIZE.
+        while (np.abs(term) > 1e-19 * total).any():
+            powers.append(product(powers[-1], A) / len(powers))
+            term = product(term, longest) / (len(powers) - 1)
+            total = total + np.abs(term)
         self._series = np.stack(powers)
         self._response = product(self._series, B)
 

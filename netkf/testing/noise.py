@@ -20,6 +20,7 @@ from netkf.laws.noise import (
     compare_variances,
     compare_with,
     component_labels,
+    is_visible,
     whiten,
 )
 from netkf.linalg.arrays import FloatArray
@@ -110,12 +111,16 @@ def check_independent(
 
 
 def whitened(
-    noise: FloatArray, S: FloatArray, size: float, where: str, rule: str, remedy: str = ""
+    noise: FloatArray, S: FloatArray, sizes: FloatArray, where: str, rule: str, remedy: str = ""
 ) -> FloatArray:
     """Return ``noise`` (..., q) of covariance ``S`` as standard white noise (..., r). Raises
-    AssertionError unless it is 0, relative to ``size``, where S has no noise.
+    AssertionError unless it is 0, relative to ``sizes`` (q,), where S has no noise, or so little
+    that rounding hides it.
     """
-    whitening = whiten(S)
-    error = float(np.abs(noise @ whitening.null_space.T).max(initial=0.0)) / size
+    factor, null_space = whiten(S)
+    visible = is_visible(factor, sizes)
+    certain = np.concatenate([null_space, factor[~visible]])
+    limits = CERTAIN * np.maximum(np.abs(certain) @ sizes, np.finfo(float).tiny)
+    error = CERTAIN * float((np.abs(noise @ certain.T) / limits).max(initial=0.0))
     demand(error <= CERTAIN, where, rule, f"{error:.3g} of its size left over", remedy)
-    return np.asarray(noise @ whitening.factor.T)
+    return np.asarray(noise @ factor[visible].T)

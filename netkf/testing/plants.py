@@ -34,6 +34,7 @@ from netkf.testing.watching import (
     ROUNDING,
     WatchedPart,
     checker,
+    component_sizes,
     demand,
     demand_array,
     demand_close,
@@ -129,7 +130,7 @@ def _check_maps(part: NonlinearPlant, copy: Any, name: str, seed: int) -> None:
         )
     labels = NoiseLabels(where, "the noise x[k+1] - f(x[k])", "Q")
     rule = "x[k+1] must be f(x[k], u[k], t_k) where Q has no noise"
-    _check_noise(states[:, 1:] - moved, part.Q, states[:, :-1], labels, rule)
+    _check_noise(states[:, 1:], moved, part.Q, states[:, :-1], labels, rule)
 
 
 def _check_curve(part: NonlinearDiffusion, copy: Any, name: str, seed: int) -> None:
@@ -183,12 +184,14 @@ def _check_moved(
     if not expected.any():
         return
     x, moved = draw(part), draw(plant)
-    error = np.abs(moved - x - expected)
+    largest = np.abs(moved).max(axis=0)
+    sizes = np.maximum(largest, np.abs(transitions[1]) @ largest) + np.finfo(float).tiny
+    error = np.abs(moved - x - expected) / sizes
     worst = int(error.max(axis=1).argmax())
     rule = f"a start that is moved must move the path by {law}, and the noise not at all"
     got = f"{moved[worst] - x[worst]} instead of {expected[worst]}"
     remedy = "let the noise not depend on x, and use the matrix that the filters are told"
-    demand(float(error.max() / (1.0 + np.abs(moved).max())) <= ROUNDING, where, rule, got, remedy)
+    demand(error.max() <= ROUNDING, where, rule, got, remedy)
 
 
 def _check_starts(
@@ -207,18 +210,26 @@ def _check_starts(
         more = together[FEW_STARTS:] if is_same else [start(random) for _ in rest]
         starts = np.array([*starts, *more])
     demand_array(where, "x(0)", starts[0], (part.n,))
-    size = 1.0 + float(np.abs(part.start_mean).max())
+    sizes = np.maximum(np.abs(part.start_mean), np.abs(starts).max(axis=0))
     rule = "x(0) must be its mean in the directions in which cov has no variance"
     remedy = "start at mean + root of cov times normals"
-    unit = whitened(starts - part.start_mean, part.start_cov, size, where, rule, remedy)
+    unit = whitened(starts - part.start_mean, part.start_cov, sizes, where, rule, remedy)
     if unit.size:
         check_white(unit[:, None], NoiseLabels(where, "x(0) less its mean", "cov"))
 
 
 def _check_noise(
-    noise: FloatArray, S: FloatArray, states: FloatArray, labels: NoiseLabels, rule: str
+    after: FloatArray,
+    moved: FloatArray,
+    S: FloatArray,
+    states: FloatArray,
+    labels: NoiseLabels,
+    rule: str,
 ) -> None:
-    e = whitened(noise, S, 1.0 + float(np.abs(states).max()), labels.where, rule)
+    """Check that ``after`` less ``moved`` (R, K, q), both of ``states``, is noise of covariance
+    ``S``.
+    """
+    e = whitened(after - moved, S, component_sizes(after, moved), labels.where, rule)
     if not e.size:
         return
     check_white(e, labels)
@@ -256,7 +267,7 @@ def _check_paths(
         after = states[:, k + 1 :: len(laws)]
         before = states[:, k : -1 : len(laws)][:, : after.shape[1]]
         labels = NoiseLabels(where, noise, field)
-        _check_noise(after - before @ Phi.T, S, before, labels, rule)
+        _check_noise(after, before @ Phi.T, S, before, labels, rule)
 
 
 def _check_slots(part: LinearPlant, copy: LinearPlant, name: str, seed: int) -> None:
@@ -290,9 +301,10 @@ def _compare_frames(part: LinearPlant, where: str, path: FloatArray, truth: Any)
     frame, origin = truth.frame_slots, np.zeros(part.n)
     for slot, x in enumerate(path):
         origin = part.F @ origin if slot else origin
+        sizes = component_sizes(path[: slot + 1])
         states = {"absolute": truth.absolute(slot), "local": truth.local(slot) + origin}
         for kind, state in states.items():
-            error = scaled_difference(np.asarray(state), x)
+            error = float((np.abs(np.asarray(state) - x) / sizes).max())
             rule = f"{kind} states must be the same in frames, up to the origin"
             text = f"{error:.3g} of the state apart in slot {slot}"
             demand(error <= FRAME_TOLERANCE, where, rule, text)
@@ -371,11 +383,11 @@ def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:
     Phi, S = moment_law(part.A, part.B, period)
     # Scaled, so that x and its moments are of one size.
     scale = np.repeat([1.0, 1.0 / period, 1.0 / period], part.n)
-    noise = (end_and_moments - start @ Phi.T) * scale
+    after, moved = end_and_moments * scale, start @ Phi.T * scale
     text = f"the noise of x and its two moments over steps of {period:g} s"
     rule = "x and its moments must follow from the state before where B has no noise"
     labels = NoiseLabels(where, text, "B")
-    _check_noise(noise, S * np.outer(scale, scale), start, labels, rule)
+    _check_noise(after, moved, S * np.outer(scale, scale), start, labels, rule)
 
 
 def _check_one_path(

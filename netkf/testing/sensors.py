@@ -33,6 +33,7 @@ from netkf.testing.watching import (
     ROUNDING,
     WatchedPart,
     checker,
+    component_sizes,
     demand,
     demand_array,
     demand_close,
@@ -254,7 +255,7 @@ def _check_linear(reader: SensorReader, node: int, seed: int) -> None:
     other = reader.read_several(reader.make_path(streams, node), numbers, other_x)
     demand_close(series.H, other.H, reader.where, "H must not depend on the state")
     expected = np.einsum("kpn,kn->kp", series.H, other_x - x)
-    error = np.abs(other.y - series.y - expected).max() / (1.0 + np.abs(expected).max())
+    error = (np.abs(other.y - series.y - expected) / component_sizes(series.y, expected)).max()
     rule = "another state must change a reading by H times the difference, and the noise not at all"
     remedy = "return H @ x plus noise that does not depend on x"
     demand(error <= ROUNDING, reader.where, rule, f"{error:.3g} of the change left over", remedy)
@@ -268,7 +269,7 @@ def _check_laws(reader: SensorReader, nodes: tuple[int, ...], seed: int) -> None
     labels = NoiseLabels(reader.where, "the noise y - H x", "R")
     runs = max(2, READINGS // (LENGTH * len(nodes)))
     factor = whiten(reader.sensor.R).factor
-    noise = np.empty((len(nodes), runs, LENGTH, reader.p))
+    noise = np.empty((len(nodes), runs, LENGTH, len(factor)))
     H = np.empty((len(nodes), runs, LENGTH, reader.p, reader.n))
     numbers = list(range(LENGTH))
     x = _make_states(seed, LENGTH, reader.n)
@@ -300,7 +301,7 @@ def _check_increments(reader: IncrementReader, node: int, seed: int) -> None:
     demand_close(cut.moments, repeated.moments, reader.where, rule, remedy=remedy)
     other, H = read(other_x, SHORT_LENGTH, cut=True), reader.sensor.H
     rule = "another state must change increments by H times its integral, and the noise not at all"
-    demand_close(other.moments - other.x @ H.T, cut.moments - cut.x @ H.T, reader.where, rule)
+    demand_close(other.moments, cut.moments + (other.x - cut.x) @ H.T, reader.where, rule)
     factor, runs = whiten(reader.sensor.R).factor, (Streams(seed, run) for run in range(RUNS))
     noise = np.array([reader.read(streams, node, x, STEPS, True).noise(H) for streams in runs])
     text = f"the noise of increments (their two moments, over steps of {STEP:g} s)"
@@ -328,9 +329,9 @@ def _check_regressors(
     )
     noise_labels = NoiseLabels(reader.where, "the noise y - H x", "R")
     for k in slots:
-        size, rule = 1.0 + float(np.abs(mean).max()), "H must be C s, s[k+1] = A s[k] + B xi"
+        rule = "H must be C s, s[k+1] = A s[k] + B xi"
         deviation, S = H[:, :, k] - sensor.C @ mean, sensor.C @ cov @ sensor.C.T
-        unit = whitened(deviation, S, size, reader.where, rule)
+        unit = whitened(deviation, S, component_sizes(H[:, :, k]), reader.where, rule)
         v = noise[:, :, k].reshape(-1, 1) / np.sqrt(sensor.R[0, 0])
         flat_H = H[:, :, k].reshape(len(v), -1)
         check_independent(v, flat_H, noise_labels, f"H, in slot {k}")

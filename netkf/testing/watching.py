@@ -8,6 +8,7 @@ import ctypes
 import dataclasses
 import functools
 import inspect
+import math
 import pickle
 import random
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -403,10 +404,18 @@ def demand_vector(where: str, value: Any) -> FloatArray:
     return array
 
 
+def component_sizes(*arrays: FloatArray) -> FloatArray:
+    """Return the largest absolute values (n,) of each component of ``arrays`` (..., n), above 0."""
+    largest = np.max([np.abs(a).reshape(-1, a.shape[-1]).max(0, initial=0.0) for a in arrays], 0)
+    # What is 0 but for rounding has no size of its own.
+    floor = max(1e-4 * largest.max(initial=0.0), float(np.finfo(float).tiny))
+    return np.asarray(np.maximum(largest, floor))
+
+
 def scaled_difference(one: FloatArray, other: FloatArray) -> float:
-    """Return the largest absolute difference over 1 + the largest absolute entry of both."""
-    size = 1.0 + max(np.abs(a).max(initial=0.0) for a in (one, other))
-    return float(np.abs(one - other).max(initial=0.0) / size)
+    """Return the largest difference of K draws (K, ...) over the size of its component in both."""
+    one, other = (a.reshape(len(a), math.prod(a.shape[1:])) for a in (one, other))
+    return float((np.abs(one - other) / component_sizes(one, other)).max(initial=0.0))
 
 
 def demand_close(

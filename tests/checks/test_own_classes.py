@@ -1,14 +1,16 @@
 """Classes that define something anew run beside the built-in one that they derive from."""
 
 import dataclasses
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from netkf.algorithms.filter import STEPS
 from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.registry import own_attributes
-from netkf.checks.check import SAME_AS_BASE, check
+from netkf.checks.check import SAME_AS_BASE, _error_difference, check
 from netkf.checks.evidence import BROKEN, HOLDS, NOT_PROMISED
 from netkf.scenario.reading import from_table
 from tests.checks.broken import HeavierLinks, LateSwaps, SameWeights, SwapsOnlyX
@@ -68,6 +70,19 @@ def test_what_should_be_the_same_and_is_not_is_broken(name, own, tmp_path):
     assert row.off > 1e-3
     assert own in row.evidence
     assert [one.replica for one in verdict.rows if one.verdict == BROKEN] == [0]
+
+
+def test_each_state_of_each_node_is_compared_in_its_own_unit():
+    """A small state beside a large one, and of a node with fewer blocks, whose last are nan."""
+    P = np.array([[np.diag([1.0, 1e-18]), np.diag([1e-18, np.nan])]])
+    twin = SimpleNamespace(
+        times=[1.0], P=P, error=np.full((1, 2, 2), 1e-9), rounding=np.array([1e-24])
+    )
+    for node, state in ((0, 0), (0, 1), (1, 0)):
+        error = twin.error.copy()
+        error[0, node, state] += 0.1 * P[0, node, state, state] ** 0.5
+        run = SimpleNamespace(**vars(twin) | {"error": error})
+        assert _error_difference(run, twin) == pytest.approx(0.1)
 
 
 def same(verb):

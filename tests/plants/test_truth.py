@@ -172,6 +172,15 @@ def test_increments_over_short_gaps_keep_their_relative_law(kind):
         assert not np.triu(L, 1).any()
 
 
+def test_units_of_states_do_not_cost_digits():
+    """Metres beside a drift of a clock: norms of A are large, and each halving cost a bit."""
+    gaps, units = np.array([0.3, 7.0]), np.array([2.0**20, 2.0**-20])
+    Phi, L = Transitions(A, B).laws(gaps)
+    found = Transitions(A * units[:, None] / units, units[:, None] * B).laws(gaps)
+    np.testing.assert_allclose(found[0] / units[:, None] * units, Phi, rtol=1e-13)
+    np.testing.assert_allclose(found[1] / units[:, None], L, rtol=1e-13, atol=0.0)
+
+
 @pytest.mark.one_in(3)
 @pytest.mark.parametrize("kind", PLANTS)
 def test_a_state_depends_on_its_time_only(kind):

@@ -2,15 +2,17 @@
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pytest
 
 from netkf import parts
 from netkf.laws.losses import compare_coincidences
-from netkf.testing import noise
+from netkf.testing import noise, watching
 from netkf.testing.channels import _check_channel
 from netkf.testing.clocks import _check_clock
+from netkf.testing.dynamics import check_derivatives
 
 LABELS = noise.NoiseLabels("Some.path", "the noise", "R")
 SEEDS = 10
@@ -65,6 +67,41 @@ def test_stated_errors_are_found_with_probability_nine_tenths(change, words):
 def test_white_noise_passes_at_every_seed():
     for seed in range(SEEDS):
         noise.check_white(white(seed, 2), LABELS)
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e9])
+def test_noise_is_judged_in_units_of_its_rows(unit):
+    """Metres beside microradians: an error of the smaller row was not seen, or rows were lost."""
+    e, units = white(0, 2) @ np.array([[1.0, 0.5], [0.0, 1.0]]), np.array([1.0, unit])
+    S = np.array([[1.0, 0.5], [0.5, 1.25]]) * np.outer(units, units)
+    sizes = np.abs(e * units).max(axis=(0, 1))
+    unit_noise = noise.whitened(e * units, S, sizes, "", "")
+    noise.check_white(unit_noise, LABELS)
+    for off in ([1.05, 1.0], [1.0, 1.05]):
+        with pytest.raises(AssertionError, match="covariance that R states"):
+            noise.check_white(noise.whitened(e * units * off, S, sizes, "", ""), LABELS)
+    # Of the state before too; noise that rounding of large numbers hides is not looked at.
+    with pytest.raises(AssertionError, match="must not depend on"):
+        noise.check_independent(e[..., 0].reshape(-1, 1), unit * e.reshape(-1, 2), LABELS, "x")
+    assert noise.whitened(e * units, S, sizes * [1.0, 1e13], "", "").shape[-1] < 2
+    with pytest.raises(AssertionError, match="left over"):
+        noise.whitened(e * units, S * [[1.0, 0.0], [0.0, 0.0]], sizes, "", "must be 0")
+
+
+def test_differences_and_derivatives_are_judged_in_units_of_their_rows():
+    x = np.array([[1.0, 1e-9], [-2.0, 3e-9]])
+    assert watching.scaled_difference(x, x * [1.0, 1.001]) > watching.ROUNDING
+    assert watching.scaled_difference(1e-9 * x, 1.001e-9 * x) == pytest.approx(1e-3, rel=0.01)
+
+    def f(x):
+        return np.array([x[0] * x[1], 1e-9 * np.sin(x[1])])
+
+    def jacobian(x, factor):
+        return np.array([[x[1], x[0]], [0.0, factor * 1e-9 * np.cos(x[1])]])
+
+    check_derivatives(("C", "f", "x"), f, partial(jacobian, factor=1.0), x[0])
+    with pytest.raises(AssertionError, match=r"entry \[1, 1\]"):
+        check_derivatives(("C", "f", "x"), f, partial(jacobian, factor=1.01), x[0])
 
 
 def test_skewed_noise_is_accused_no_more_often_than_stated(monkeypatch):

@@ -26,6 +26,7 @@ from tests.testing.broken_plants import FLOW, LINEAR, MATCHINGS, PLANTS, REGRESS
 from tests.testing.sound_parts import HEALTHY_MATCHINGS, HEALTHY_PLANTS, HEALTHY_SENSORS
 from tests.testing.test_channels import refused
 
+METRES_AND_RADIANS = [[0.5, 2e-8], [2e-8, 3e-15]]
 SMALL = {"Drifts", "FixedF"}
 """Breaches that a quarter of the draws does not show."""
 
@@ -63,7 +64,7 @@ def test_every_breach_of_a_matching_is_named(name):
 def sensors():
     return [
         parts.LinearSensor(nodes=(0,), H=[[1.0, 0.5]], R=[[0.5]]),
-        parts.LinearSensor(nodes=(0, 2, 5, 7), H=np.eye(2), R=[[0.5, 0.2], [0.2, 0.3]]),
+        parts.LinearSensor(nodes=(0, 2, 5, 7), H=np.diag([1.0, 1e-7]), R=METRES_AND_RADIANS),
         parts.LinearSensor(nodes=(0, 2), H=[[1.0]], R=[[1e-8]], sampling=parts.Poisson(rate=2.0)),
         parts.LinearSensor(nodes=(4,), H=[[1.0]], R=[[1e6]], sampling=jittered()),
         parts.RegressorSensor(**REGRESSOR),

@@ -16,7 +16,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.laws.noise import MIN_VARIANCE_SHARE, NoiseDraws, noise_draws, transition_law, whiten
+from netkf.laws.noise import (
+    MIN_VARIANCE_SHARE,
+    NoiseDraws,
+    is_visible,
+    noise_draws,
+    transition_law,
+    whiten,
+)
 from netkf.laws.stating import stated_part
 from netkf.linalg.arrays import FloatArray, IntArray, square_root
 from netkf.plants.curves import NonlinearDiffusion
@@ -33,21 +40,17 @@ MAX_STEPS = 64
 """Steps of a path, and readings of a sensor, that are tested in one run."""
 MAX_ROWS = 24
 """Rows of readings of all sensors together that are tested."""
-VISIBLE = 1e-5
-"""Largest rounding error of a state, relative to the deviation of the noise, for a usable step."""
 
 
 class PathLaw(NamedTuple):
     """The law of S steps ``x(t + gap) = Phi x(t) + w`` of a path: ``times`` (S + 1,) of the states
     in seconds, Phi (S, n, n), ``white`` (S, d, n) that whitens w of rank d (rows of nan where the
-    rank is less), the largest standard ``deviation`` (S,) of an entry of w, and the root mean
-    squares ``sizes`` (S, n) of states before.
+    rank is less), and the root mean squares ``sizes`` (S, n) of states before.
     """
 
     times: FloatArray
     Phi: FloatArray
     white: FloatArray
-    deviation: FloatArray
     sizes: FloatArray
 
 
@@ -78,9 +81,8 @@ def path_law(scenario: Scenario) -> PathLaw | None:
         sizes.append(np.sqrt(np.diagonal(covariance) + mean**2))
         mean, covariance = Phi @ mean, Phi @ covariance @ Phi.T + W
         white[k, : len(factors[id(W)])] = factors[id(W)]
-    deviation = np.array([np.sqrt(np.diagonal(W).max()) for _, W in steps])
     Phi_of_steps = np.array([Phi for Phi, _ in steps]).reshape(-1, n, n)
-    return PathLaw(times, Phi_of_steps, white, deviation, np.array(sizes).reshape(-1, n))
+    return PathLaw(times, Phi_of_steps, white, np.array(sizes).reshape(-1, n))
 
 
 def pieces_between(plant: Any, changes: Sequence[Any], start: Any, end: Any) -> Iterator[Any]:
@@ -109,9 +111,9 @@ def plant_noises(scenario: Scenario, streams: Streams) -> NoiseDraws | None:
     x = _states(scenario, streams, law)
     noise = x[1:] - np.einsum("kij,kj->ki", law.Phi, x[:-1])
     # Where the state has outgrown the noise, x(t + gap) - Phi x(t) is mostly rounding.
-    accurate = np.abs(x[1:]).max(axis=1) * np.finfo(float).eps < VISIBLE * law.deviation
-    usable = np.logical_and.accumulate(accurate)
-    whitened = np.where(usable[:, None], np.einsum("kij,kj->ki", law.white, noise), np.nan)
+    sizes = np.abs(x[1:]) + np.einsum("kij,kj->ki", np.abs(law.Phi), np.abs(x[:-1]))
+    usable = np.logical_and.accumulate(is_visible(law.white, sizes))
+    whitened = np.where(usable, np.einsum("kij,kj->ki", law.white, noise), np.nan)
     return noise_draws(whitened, _standardise(x[:-1], law.sizes)[:, :, None])
 
 
@@ -330,4 +332,6 @@ def read_pieces(
 def whitened_starts(scenario: Scenario, x: FloatArray) -> FloatArray:
     """Return x(0) ``x`` (R, n) of R runs less the stated mean and whitened, (R, d)."""
     plant: Any = scenario.plant
-    return np.asarray((x - plant.start_mean) @ whiten(plant.start_cov, MIN_VARIANCE_SHARE).factor.T)
+    factor = whiten(plant.start_cov, MIN_VARIANCE_SHARE).factor
+    factor = factor[is_visible(factor, np.abs(plant.start_mean))]
+    return np.asarray((x - plant.start_mean) @ factor.T)

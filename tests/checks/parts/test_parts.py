@@ -13,7 +13,7 @@ import netkf
 from netkf.checks.evidence import BROKEN, HOLDS, judge
 from netkf.checks.laws import find
 from netkf.checks.parts.events import _entity_indices
-from netkf.checks.parts.noises import start_states
+from netkf.checks.parts.noises import path_law, plant_noises, start_states, whitened_starts
 from netkf.checks.parts.rows import part_promises
 from netkf.checks.parts.samples import stack_parts, summarise_parts
 from netkf.laws.intervals import probability_interval, scale_interval
@@ -37,6 +37,7 @@ from netkf.parts import (
     Renewal,
     UniformDelay,
 )
+from netkf.rng.streams import Streams
 from netkf.scenario.reading import from_table as scenario_from
 
 PLANT = {
@@ -311,6 +312,23 @@ def test_whitening_gives_the_identity_and_drops_certain_directions():
     assert white.shape == (2, 4)
     assert np.allclose(white @ root @ root.T @ white.T, np.eye(2))
     assert np.allclose(null @ root, 0.0)
+
+
+@pytest.mark.parametrize("table", [SLOTS, CLOCKS], ids=["slots", "clocks"])
+def test_noise_of_a_plant_is_looked_at_in_units_of_its_states(table):
+    """Noise of a state in small units was left out beside that of a large one."""
+    units, plant = np.array([2.0**10, 2.0**-20]), {"mean": [0.0, 0.0]}
+    of_columns = {"Q": units, "cov": units, "B": np.ones(2), "F": 1.0 / units, "A": 1.0 / units}
+    for name in of_columns.keys() & table["plant"].keys():
+        plant[name] = (table["plant"][name] * units[:, None] * of_columns[name]).tolist()
+    sensors = [{**one, "H": (one["H"] / units).tolist()} for one in table["sensors"]]
+    plain = from_table(table)
+    scenario = from_table({**table, "plant": table["plant"] | plant, "sensors": sensors})
+    np.testing.assert_allclose(path_law(scenario).white * units, path_law(plain).white, rtol=1e-9)
+    assert np.isfinite(plant_noises(scenario, Streams(1, 0)).z).all()
+    assert whitened_starts(scenario, start_states(scenario, 1, 3)).shape == (3, 2)
+    # A mean that hides the noise of the start: x(0) is rounded.
+    assert not whitened_starts(scenario.replace({"plant.mean": [1e20, 1e20]}), units[None]).size
 
 
 LABELS = ["a", "b", "c"]
