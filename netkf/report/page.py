@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from importlib import resources
+from mimetypes import MimeTypes
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -95,8 +96,13 @@ def write_report(
 
 
 def _require_page(path: Path) -> None:
-    """Raise ScenarioError if ``path`` is a file that is no page; WriteError if it is no file."""
+    """Raise ScenarioError if ``path`` is or would be a file that is no page; WriteError if it is no
+    file.
+    """
     require_own(path)
+    if MimeTypes().guess_type(path.name)[0] not in (None, "text/html"):
+        rule = "is no name of a page, which is HTML"
+        raise ScenarioError("--out", rule, str(path), f"name a file {path.stem}.html")
     if path.is_dir():
         raise WriteError(OSError(errno.EISDIR, ""), path)
     if not path.is_file():

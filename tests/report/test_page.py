@@ -736,6 +736,10 @@ def test_only_pages_are_overwritten(slots, tmp_path, capsys):
     assert said.count("\n") == 1
     assert "not a page of netkf report" in said
     assert notes.read_bytes() == kept
+    assert main(["report", str(slots), "--out", str(tmp_path / "notes.pdf")]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "name a file notes.html" in said
 
 
 def test_a_summary_without_its_parts_is_refused_in_one_line(ring, tmp_path):
