@@ -152,7 +152,9 @@ def _decided(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
             f"{_describe(log, int(rows[k]))} is {taken[k]:.9g} s after its "
             f"message was sent in phase {sent['phase'][k]}, not {age[k]:.9g} s"
         )
-    waiting = log["t"][np.setdiff1d(sends["row"], places)]
+    is_open = log["kind"] == SEND
+    is_open[places] = False
+    waiting = log["t"][is_open]
     longest = scenario.longest_delay
     limit = scenario.horizon * (1.0 - TIME_TOLERANCE)
     if run.status == "complete" and (waiting + longest < limit).any():
