@@ -96,9 +96,16 @@ class Encoder:
         self._quantisation, self._random = quantisation, random
 
     def encode(self, payload: Any) -> tuple[Any, int]:
-        """Return the payload that is received, and how many of its numbers were clipped."""
+        """Return the payload that is received, and how many of its numbers were clipped: floats,
+        and arrays of them, in tuples and lists too.
+        """
+        if isinstance(payload, float | np.floating):
+            received, count = self._encode_array(np.array(payload, dtype=np.float64))
+            return received[()], count
         if isinstance(payload, np.ndarray):
-            return self._encode_array(payload) if payload.dtype == np.float64 else (payload, 0)
+            if not np.issubdtype(payload.dtype, np.floating):
+                return payload, 0
+            return self._encode_array(payload.astype(np.float64))
         if hasattr(payload, "fields"):
             # Messages of kernels: rows of single payloads, with an axis of lanes behind.
             numbers = payload.sender.run.numbers
@@ -108,9 +115,9 @@ class Encoder:
             }
             arrays = {k: np.array([row for row, _ in v])[..., None] for k, v in rows.items()}
             return payload.with_fields(arrays), sum(n for v in rows.values() for _, n in v)
-        if isinstance(payload, tuple):
+        if isinstance(payload, tuple | list):
             parts = [self.encode(part) for part in payload]
-            make = getattr(payload, "_make", tuple)
+            make = getattr(payload, "_make", type(payload))
             return make([part for part, _ in parts]), sum(count for _, count in parts)
         return payload, 0
 

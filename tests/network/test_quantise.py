@@ -1,16 +1,20 @@
 """Messages of few bits: the error of numbers, and what it does to a filter."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 import scipy.stats
 
 import netkf
+from netkf.algorithms.traits import Timing
 from netkf.checks.check import find_checks
 from netkf.checks.equations import WITHOUT_PAPER
 from netkf.core.errors import ScenarioError
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.engines.simpy.engine import SimpyEngine
 from netkf.network.quantise import Encoder, Quantisation
+from netkf.parts import Filter, Filtering
 from netkf.rng.streams import Streams
 from netkf.runs.summary import PromisedTraces, SummarySink, summarise
 from netkf.scenario.reading import from_table
@@ -109,6 +113,39 @@ def test_triangles_stay_triangles_and_symmetric_matrices_symmetric():
     assert (upper[np.triu_indices(3)] != root.T[np.triu_indices(3)]).all()
     assert np.array_equal(both, both.T)
     assert (count, name) == (7, "x")
+
+
+def test_numbers_of_any_width_are_of_few_bits():
+    quantisation = Quantisation(bits=5, range=4.0)
+    sent = 1.3, [np.float64(-0.7), np.array([0.4, 2.0], dtype=np.float32)], True
+    (one, (other, array), flag), clipped = Encoder(quantisation, np.random.default_rng(3)).encode(
+        sent
+    )
+    errors = np.array([one - 1.3, other + 0.7, *(array - [0.4, 2.0])])
+    assert (errors != 0.0).all()
+    assert (np.abs(errors) <= 0.5 * quantisation.step + 1e-6).all()
+    assert (flag, clipped) == (True, 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Sure(Filter):
+    """Tells the same number again and again, and keeps what it hears."""
+
+    timing = Timing(schedule=("exchange",))
+    told = (0.3,)
+
+    def emit(self, state, exchange):
+        return state, self.told
+
+    def absorb(self, state, messages, exchange):
+        return state._replace(xhat=np.array([messages[0].payload[0]])) if messages else state
+
+
+def test_each_transmission_of_the_same_payload_takes_its_own_dither(scenario_of):
+    few = {"filter": Filtering(Sure()), "network.quantise": {"bits": 3, "range": 1.0}}
+    heard = netkf.simulate(scenario_of(bits=0, filter_="local").replace(few)).xhat[1:, 0, 0]
+    assert len(np.unique(heard)) == len(heard)
+    assert np.abs(heard - 0.3).max() <= 0.125
 
 
 def test_nothing_is_received_as_nothing(scenario_of):

@@ -123,8 +123,10 @@ class Transmitter:
         """Begin another transmission of each of these ``senders``: draw what its hearers share;
         unless it is ``fresh`` they keep what they have.
         """
-        if self._airtime is not None:
-            for sender in senders:
+        for sender in senders:
+            # The same payload takes other dither in another transmission.
+            self._encoded.pop(sender, None)
+            if self._airtime is not None:
                 self._airtime.begin(sender)
         if self.broadcasts is not None:
             self.broadcasts.begin(senders, fresh)
