@@ -24,12 +24,11 @@ from __future__ import annotations
 import bisect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.filter import Filter, NetworkInfo, NodeInfo
+from netkf.algorithms.filter import Filter, NodeInfo
 from netkf.algorithms.kernels.estimates import transform_mean
 from netkf.algorithms.kernels.run import absorb as nothing
 from netkf.algorithms.kernels.run import shift_product, shift_vector, write_innovation
@@ -37,7 +36,7 @@ from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.traits import Analysis, Needs, Timing
-from netkf.linalg.arrays import FloatArray, square_root
+from netkf.linalg.arrays import FloatArray, cached_by_entries, square_root
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import load, load_flags, select, spread, store
 
@@ -100,17 +99,18 @@ class GainSequence:
 
     def __init__(
         self,
-        matrices: tuple[FloatArray, FloatArray, FloatArray],
+        F: FloatArray,
+        Q: FloatArray,
+        cov: FloatArray,
         information: FloatArray,
         heard: tuple[tuple[int, ...], ...],
-        changes: Sequence[int] = (),
+        changes: Sequence[int],
     ) -> None:
-        """Set the errors at the start of a network: ``matrices`` are F and Q (S, n, n) of the
-        pieces of the plant before and after each of the ``changes`` (slots), and the covariance of
-        x(0); ``information`` and ``heard`` are those of ``NetworkInfo``.
+        """Set the errors at the start of a network: ``F`` and ``Q`` (S, n, n) are those of the
+        pieces of the plant before and after each of the ``changes`` (slots), ``cov`` (n, n) is the
+        covariance of x(0); ``information`` and ``heard`` are those of ``NetworkInfo``.
         """
-        self._F, Q, cov = matrices
-        self._changes = changes
+        self._F, self._changes = F, changes
         self._n, self._neighbours, self._information = len(cov), heard, information
         n, N = self._n, len(heard)
         self._pseudo = pseudo_states(self._information.sum(axis=0))
@@ -251,25 +251,8 @@ def optimal_gain(e: FloatArray, theta: FloatArray, terms: FloatArray) -> FloatAr
     return np.asarray((e @ V.T * inverse) @ (U.T * scale))
 
 
-def gain_sequence(
-    matrices: tuple[FloatArray, FloatArray], network: NetworkInfo, cov: FloatArray, changes: Any
-) -> GainSequence:
-    """Return the gains of a ``network`` of nodes with F and Q (S, n, n) of each piece between the
-    ``changes`` (slots) that start with the covariance ``cov`` (n, n); all of its nodes and runs
-    share them.
-    """
-    # Bytes can be the key of a cache.
-    parts = (*matrices, cov, network.information)
-    entries = tuple(np.asarray(part, dtype=np.float64).tobytes() for part in parts)
-    return _shared_sequence(len(cov), entries, network.heard, tuple(changes.tolist()))
-
-
-@lru_cache(maxsize=8)
-def _shared_sequence(
-    n: int, entries: tuple[bytes, ...], heard: tuple[tuple[int, ...], ...], changes: tuple[int, ...]
-) -> GainSequence:
-    F, Q, cov, information = (np.frombuffer(part).reshape(-1, n, n) for part in entries)
-    return GainSequence((F, Q, cov[0]), information, heard, changes)
+gain_sequence = cached_by_entries(8)(GainSequence)
+"""The gains of a network, which all of its nodes and runs share."""
 
 
 @kernel
@@ -408,8 +391,9 @@ def prepare_consensus_innovations(
     assert network is not None
     if record.first_slot == first and len(record.table_row) == count:
         return
-    start = np.ascontiguousarray(record.start[0, ..., 0])
-    sequence = gain_sequence((record.F, record.Q), network, start, record.changes)
+    matrices = record.F, record.Q, record.start[0, ..., 0]
+    changes = tuple(record.changes.tolist())
+    sequence = gain_sequence(*matrices, network.information, network.heard, changes)
     record.table_row, gains = sequence.table(first, count, [info.place for info in infos])
     record.B, record.M, record.K, record.roots = map(np.ascontiguousarray, gains)
     record.first_slot = first

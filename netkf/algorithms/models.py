@@ -12,7 +12,7 @@ import bisect
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -24,30 +24,20 @@ from netkf.algorithms.kernels.rates import DIFFERENCE, RateTables, move_by_rate,
 from netkf.algorithms.kernels.root_flow import FlowTable, flow_root, flow_table, gain_update_root
 from netkf.algorithms.kernels.run import CLOSE, usable
 from netkf.algorithms.kernels.square_root import lower_root
-from netkf.linalg.arrays import FloatArray, IntArray, enlarged, square_root, symmetric
+from netkf.linalg.arrays import (
+    FloatArray,
+    IntArray,
+    cached_by_entries,
+    enlarged,
+    square_root,
+    symmetric,
+)
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import ONE, aligned
 from netkf.linalg.vector_functions import VectorFunction
 
-TABLES = 32
-"""Flow tables in the cache, at most 256 KiB each."""
-
-
-def _shared_flow_table(
-    A: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray, longest: float
-) -> FlowTable:
-    """Return the flow table of a model, shared by equal ones: it takes some 30 ms."""
-    parts = (np.asarray(part, dtype=np.float64).tobytes() for part in (A, Q, H, R))
-    return _cached_flow_table(len(A), tuple(parts), longest)
-
-
-@lru_cache(maxsize=TABLES)
-def _cached_flow_table(n: int, parts: tuple[bytes, ...], longest: float) -> FlowTable:
-    """Return the flow table of a model whose A, Q, H and R are the bytes in ``parts``."""
-    # Bytes have lost their shapes: p follows from the length of H.
-    A, Q, H, R = (np.frombuffer(part) for part in parts)
-    p = len(H) // n
-    return flow_table(A.reshape(n, n), Q.reshape(n, n), H.reshape(p, n), R.reshape(p, p), longest)
+shared_flow_table = cached_by_entries(32)(flow_table)
+"""The flow table of a model, shared by equal ones: it takes some 30 ms, and at most 256 KiB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +76,7 @@ class FlowModel:
         """Table from which ``flow_root`` computes the root (n, n) of P after any gap, with this
         node's increments.
         """
-        return _shared_flow_table(self.A, self.Q, self.H, self.R, self.horizon)
+        return shared_flow_table(self.A, self.Q, self.H, self.R, self.horizon)
 
     @cached_property
     def unobserved_flow(self) -> FlowTable:
@@ -94,7 +84,7 @@ class FlowModel:
         readings.
         """
         nothing = np.zeros((0, len(self.A)))
-        return _shared_flow_table(self.A, self.Q, nothing, np.zeros((0, 0)), self.horizon)
+        return shared_flow_table(self.A, self.Q, nothing, np.zeros((0, 0)), self.horizon)
 
     def predict(
         self, xhat: FloatArray, root: FloatArray, gap: float

@@ -14,13 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 import scipy
 
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, cached_by_entries
 from netkf.linalg.spectra import balance
 
 MAX_PROJECTOR = 1e5
@@ -118,11 +117,10 @@ class ModeFrame:
     excess: float
 
 
-@lru_cache(maxsize=8)
-def _shared_frame(entries: bytes, n: int, slotted: bool) -> ModeFrame:
-    """Return the frame of a plant whose F (``slotted``) or A (n, n) has these ``entries``."""
-    A = np.frombuffer(entries).reshape(n, n)
-    rates = slot_rates(A) if slotted else flow_rates(A)
+@cached_by_entries(8)
+def _shared_frame(A: FloatArray, slotted: bool) -> ModeFrame:
+    """Return the frame of a plant with ``A`` (n, n), or F if it is ``slotted``."""
+    n, rates = len(A), slot_rates(A) if slotted else flow_rates(A)
     tolerance = ROUNDING * (1.0 if slotted else flow_size(A))
     # Modes on the wrong side lose digits as fast as their rates: no such mode is best. All modes on
     # one side need no other coordinates, and are tried first among equals.
@@ -152,12 +150,12 @@ def _shared_frame(entries: bytes, n: int, slotted: bool) -> ModeFrame:
 
 def slot_frame(F: FloatArray) -> ModeFrame:
     """Return the frame of a plant in slots with F (n, n); plants with the same share it."""
-    return _shared_frame(np.asarray(F, dtype=np.float64).tobytes(), len(F), True)
+    return _shared_frame(F, True)
 
 
 def flow_frame(A: FloatArray) -> ModeFrame:
     """Return the frame of a plant under clocks with A (n, n) in 1/s."""
-    return _shared_frame(np.asarray(A, dtype=np.float64).tobytes(), len(A), False)
+    return _shared_frame(A, False)
 
 
 def still_frame(n: int) -> ModeFrame:
@@ -180,11 +178,10 @@ class RateGroups(NamedTuple):
     kept: FloatArray
 
 
-@lru_cache(maxsize=8)
-def _shared_groups(entries: bytes, n: int) -> RateGroups:
-    """Return the groups of rates of a plant whose A (n, n) has these ``entries``."""
-    A = np.frombuffer(entries).reshape(n, n)
-    rates, size = flow_rates(A), flow_size(A)
+@cached_by_entries(8)
+def rate_groups(A: FloatArray) -> RateGroups:
+    """Return the groups of modes of a plant with A (n, n) in 1/s, by their rates of decay."""
+    n, rates, size = len(A), flow_rates(A), flow_size(A)
     ordered = np.sort(rates)[::-1]
     # A group's rate is that of its fastest mode, which must not grow; all that do not decay, or not
     # by more than rounding, are one group.
@@ -204,8 +201,3 @@ def _shared_groups(entries: bytes, n: int) -> RateGroups:
     decays[decays <= ROUNDING * size] = 0.0
     projectors = np.array(parts)
     return RateGroups(decays, projectors, A + np.einsum("g,gij->ij", decays, projectors))
-
-
-def rate_groups(A: FloatArray) -> RateGroups:
-    """Return the groups of modes of a plant with A (n, n) in 1/s, by their rates of decay."""
-    return _shared_groups(np.asarray(A, dtype=np.float64).tobytes(), len(A))

@@ -32,7 +32,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -45,7 +44,7 @@ from netkf.algorithms.kernels.run import predict_estimate, shift_vector, use_rea
 from netkf.algorithms.kernels.square_root import triangularise
 from netkf.algorithms.modes import RateGroups, rate_groups
 from netkf.algorithms.records import Kernels, Record, packed_numbers
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, cached_by_entries
 from netkf.linalg.compiling import kernel
 from netkf.linalg.generic import drop_lane
 from netkf.linalg.jacobi import diagonalise
@@ -72,7 +71,7 @@ def record(infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
     ``elapsed`` that they refer to, ``rounds`` and ``number`` count broadcasts.
     """
     n = len(models[0].A)
-    groups, unit, table = _tables_of(n, models[0].A.tobytes())
+    groups, unit, table = _tables_of(models[0].A)
     m = 1 + n * n + n * len(groups.rates)
     return Record(
         node={
@@ -97,16 +96,13 @@ def record(infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
     )
 
 
-@lru_cache(maxsize=16)
-def _tables_of(n: int, A: bytes) -> tuple[RateGroups, float, FloatArray]:
-    """Return groups and table of a plant, shared by equal ones: they take some 20 ms."""
-    groups = rate_groups(np.frombuffer(A).reshape(n, n))
-    return groups, *_table_of(groups)
-
-
-def _table_of(groups: RateGroups) -> tuple[float, FloatArray]:
-    """Return the length of a cell (s), and Taylor coefficients (CELLS, terms, n n + G)."""
-    kept, rates, terms = groups.kept, groups.rates, len(ORDER_9) + 1
+@cached_by_entries(16)
+def _tables_of(A: FloatArray) -> tuple[RateGroups, float, FloatArray]:
+    """Return groups of a plant, the length of a cell (s), and Taylor coefficients (CELLS, terms,
+    n n + G), shared by equal plants: they take some 20 ms.
+    """
+    groups, terms = rate_groups(A), len(ORDER_9) + 1
+    kept, rates = groups.kept, groups.rates
     norm = max(np.abs(balance(kept)[0]).sum(axis=1).max(), rates.max(initial=0.0), 1e-12)
     unit = 2.0 ** np.floor(np.log2(REACH / norm))
     middles = unit * (np.arange(CELLS) + 0.5)
@@ -119,7 +115,7 @@ def _table_of(groups: RateGroups) -> tuple[float, FloatArray]:
     # A plant of one state for each rate: powers of one number.
     parts = [series(kept), *(series(np.eye(1) * rate) for rate in rates)]
     parts = [part.reshape(CELLS, terms, -1) for part in parts]
-    return float(unit), np.concatenate(parts, axis=2).astype(np.float64)
+    return groups, float(unit), np.concatenate(parts, axis=2).astype(np.float64)
 
 
 def weights(state: Any) -> dict[str, list[float]]:

@@ -365,20 +365,33 @@ class _Lines:
                 self.comments[self.number] = line
 
 
+@contextmanager
+def _unpacked(source: SourceFile, what: str, if_too_large: str) -> Iterator[_Bounded]:
+    """Yield an open file, unpacked if it is compressed by gzip; raises ScenarioError if it cannot
+    be read as ``what``, or has more than MAX_BYTES, with this remedy.
+    """
+    start = b""
+    try:
+        with source.full.open("rb") as packed:
+            start = packed.peek(2)[:2]  # pipes cannot go back
+            yield _Bounded(gzip.GzipFile(fileobj=packed) if start == b"\x1f\x8b" else packed)
+    except _TooLargeError:
+        rule = f"{source.name} must have at most {MAX_BYTES >> 20} MiB"
+        raise ScenarioError("path", rule, None, if_too_large) from None
+    except (OSError, EOFError, zlib.error, UnicodeDecodeError, csv.Error) as error:
+        encoding = "save it as UTF-8" if isinstance(error, UnicodeDecodeError) else ""
+        remedy = _FOREIGN.get(start, encoding or "correct the file")
+        raise ScenarioError(
+            "path", f"{source.name} cannot be read{what}", str(error), remedy
+        ) from None
+
+
 def read_content(source: SourceFile) -> bytes:
     """Return the bytes of a file, unpacked if it is compressed by gzip; raises ScenarioError if it
     cannot be read or has more than MAX_BYTES.
     """
-    try:
-        with source.full.open("rb") as packed:
-            is_packed = packed.peek(2)[:2] == b"\x1f\x8b"
-            return _Bounded(gzip.GzipFile(fileobj=packed) if is_packed else packed).readall() or b""
-    except _TooLargeError:
-        rule = f"{source.name} must have at most {MAX_BYTES >> 20} MiB"
-        raise ScenarioError("path", rule, None, "leave out attributes") from None
-    except (OSError, EOFError, zlib.error) as error:
-        rule = f"{source.name} cannot be read"
-        raise ScenarioError("path", rule, str(error), "correct the file") from None
+    with _unpacked(source, "", "leave out attributes") as file:
+        return file.readall() or b""
 
 
 @contextmanager
@@ -386,30 +399,17 @@ def open_table(source: SourceFile) -> Iterator[_Sheet]:
     """Yield the header and the rows, as texts, of an open table; raises ScenarioError if the file
     is none.
     """
-    start = b""
-    try:
-        with source.full.open("rb") as packed:
-            start = packed.peek(2)[:2]  # pipes cannot go back
-            is_packed = start == b"\x1f\x8b"
-            unpacked = gzip.GzipFile(fileobj=packed) if is_packed else packed
-            buffered = io.BufferedReader(_Bounded(unpacked), 1 << 16)
-            with io.TextIOWrapper(buffered, newline="", encoding="utf-8-sig") as file:
-                lines = _Lines(file)
-                texts = (line for line in lines if line.strip())
+    remedy = "split readings among several [[sensors]] entries, or write fewer digits"
+    with _unpacked(source, " as a UTF-8 table", remedy) as unpacked:
+        buffered = io.BufferedReader(unpacked, 1 << 16)
+        with io.TextIOWrapper(buffered, newline="", encoding="utf-8-sig") as file:
+            lines = _Lines(file)
+            texts = (line for line in lines if line.strip())
+            names = next(texts, "")
+            if names.lower().lstrip('"').startswith("sep="):  # a line that spreadsheets write
                 names = next(texts, "")
-                if names.lower().lstrip('"').startswith("sep="):  # a line that spreadsheets write
-                    names = next(texts, "")
-                separator = next((s for s in ";\t" if s in names), ",")
-                reader = csv.reader(itertools.chain([names], texts), delimiter=separator)
-                header = [name.strip() for name in next(reader, [])]
-                rows = ((lines.number, row) for row in reader if any(map(str.strip, row)))
-                yield _Sheet(header, rows, separator, lines.comments)
-    except _TooLargeError:
-        rule = f"{source.name} must have at most {MAX_BYTES >> 20} MiB"
-        remedy = "split readings among several [[sensors]] entries, or write fewer digits"
-        raise ScenarioError("path", rule, None, remedy) from None
-    except (OSError, EOFError, zlib.error, UnicodeDecodeError, csv.Error) as error:
-        rule = f"{source.name} cannot be read as a UTF-8 table"
-        encoding = "save it as UTF-8" if isinstance(error, UnicodeDecodeError) else ""
-        remedy = _FOREIGN.get(start, encoding or "correct the file")
-        raise ScenarioError("path", rule, str(error), remedy) from None
+            separator = next((s for s in ";\t" if s in names), ",")
+            reader = csv.reader(itertools.chain([names], texts), delimiter=separator)
+            header = [name.strip() for name in next(reader, [])]
+            rows = ((lines.number, row) for row in reader if any(map(str.strip, row)))
+            yield _Sheet(header, rows, separator, lines.comments)

@@ -5,15 +5,17 @@ from __future__ import annotations
 import ctypes
 import numbers
 import sys
-from collections.abc import Sequence
-from functools import cache
-from typing import Any
+from collections.abc import Callable, Sequence
+from functools import cache, lru_cache
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+P = ParamSpec("P")
+T = TypeVar("T")
 
 __all__ = [
     "ArrayLike",
@@ -21,6 +23,7 @@ __all__ = [
     "IntArray",
     "array_address",
     "block_diagonal",
+    "cached_by_entries",
     "enlarged",
     "readonly_array",
     "real_numbers",
@@ -40,6 +43,37 @@ def array_address(array: Any) -> int:
         return ctypes.addressof(ctypes.c_char.from_buffer(array))
     except (TypeError, ValueError):  # read-only, or empty
         return int(array.ctypes.data)
+
+
+class _Entries(NamedTuple):
+    shape: tuple[int, ...]
+    entries: bytes
+
+
+def cached_by_entries(maxsize: int) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Return a decorator that keeps the last ``maxsize`` results of a function of arrays and of
+    values with a hash: arrays with the same entries, which the function must not write to, share
+    one.
+    """
+
+    def decorate(function: Any) -> Any:
+        @lru_cache(maxsize)
+        def compute(*keys: Any) -> Any:
+            return function(
+                *(
+                    np.frombuffer(key.entries).reshape(key.shape) if type(key) is _Entries else key
+                    for key in keys
+                )
+            )
+
+        def as_key(value: Any) -> Any:
+            if not isinstance(value, np.ndarray):
+                return value
+            return _Entries(value.shape, np.asarray(value, dtype=np.float64).tobytes())
+
+        return lambda *values: compute(*map(as_key, values))
+
+    return decorate
 
 
 def readonly_array(value: ArrayLike) -> FloatArray:

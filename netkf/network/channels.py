@@ -16,7 +16,6 @@ from netkf.network.delays import (
     NoDelay,
     checked_delay,
     delay_depends_on_message,
-    draw_delay,
     draw_delays,
 )
 from netkf.network.graphs import Link, Topology
@@ -231,18 +230,12 @@ class ChannelSampler:
 
     def draw(self) -> ChannelDraw:
         """Return the numbers of the next activation; a fixed delay is itself, or 0."""
-        uniform, bad, delay = 0.0, False, self._fixed_delay
-        if self._loss_random is not None:
-            uniform = float(self._loss_random.random())
-        if self._state_random is not None:
-            self._bad = bad = next_state(self._loss, self._link, self._bad, self._state_random)
-        if self._delay_random is not None:
-            delay = draw_delay(self._delay, self._delay_random)
-        return ChannelDraw(uniform, bad, delay)
+        uniform, bad, delay = self.draws(1)
+        return ChannelDraw(float(uniform[0]), bool(bad[0]), float(delay[0]))
 
     def draws(self, count: int) -> tuple[FloatArray, np.ndarray, FloatArray]:
         """Return uniform numbers, states (True: bad) and delays (s) of ``count`` activations,
-        (count,) each, equal to those of ``draw``.
+        (count,) each.
         """
         uniform, bad = np.zeros(count), np.zeros(count, dtype=bool)
         if self._loss_random is not None:

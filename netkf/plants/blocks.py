@@ -14,7 +14,6 @@ from functools import cached_property
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-import scipy
 
 from netkf.core.errors import ScenarioError, errors_under, quote, suggest_nearest
 from netkf.core.fields import (
@@ -223,18 +222,9 @@ class StackedInput(Input):
     def exogenous(self) -> Exogenous:
         """The systems of all inputs side by side, which begins anew where any of them jumps."""
         parts = [one.exogenous for one in self.inputs]
-        times, z = np.unique(np.concatenate([part.times for part in parts])), []
-        for part in parts:
-            last = part.last(times)
-            gaps = (times - part.times[last])[:, None, None]
-            moved = part.z[last]
-            if part.S.any():
-                moved = (scipy.linalg.expm(gaps * part.S) @ moved[:, :, None])[:, :, 0]
-            z.append(np.where(last[:, None] >= 0, moved, 0.0))
-        S, C = (
-            block_diagonal(matrices) for matrices in zip(*((p.S, p.C) for p in parts), strict=True)
-        )
-        return Exogenous(times, S, C, np.concatenate(z, axis=1))
+        times = np.unique(np.concatenate([part.times for part in parts]))
+        S, C = (block_diagonal([getattr(part, name) for part in parts]) for name in "SC")
+        return Exogenous(times, S, C, np.concatenate([p.states(times) for p in parts], axis=1))
 
     def values(self, times: FloatArray) -> FloatArray:
         """Return u (K, m) at K ``times`` (K,) in seconds."""

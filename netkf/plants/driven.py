@@ -14,7 +14,7 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import apply
-from netkf.plants.readings import covariance_of, read_many, readings_of
+from netkf.plants.readings import read_many, readings_of
 from netkf.plants.response import Response, moments_over
 
 
@@ -137,10 +137,9 @@ class MovedFunction:
     def __init__(self, function: Any, m: FloatArray) -> None:
         self._function, self._m = function, m
 
-    @property
-    def size(self) -> int:
-        """The number p of values of a reading."""
-        return int(self._function.size)
+    def __getattr__(self, name: str) -> Any:
+        """Return what no origin changes, such as the difference of two readings."""
+        return getattr(self.__dict__["_function"], name)
 
     @property
     def parts(self) -> list[MovedFunction]:
@@ -148,18 +147,9 @@ class MovedFunction:
         parts = getattr(self._function, "parts", [self._function])
         return [MovedFunction(part, self._m) for part in parts]
 
-    def support(self, n: int) -> np.ndarray:
-        """Return the entries (k,) of a state of ``n`` that the reading depends on."""
-        entries: np.ndarray = self._function.support(n)
-        return entries
-
     def value(self, x: FloatArray) -> FloatArray:
         """Return the reading (p,) without noise at the state x (n,)."""
         return np.asarray(self._function.value(x + self._m))
-
-    def difference(self, y: FloatArray, expected: FloatArray) -> FloatArray:
-        """Return the innovation (p,): a reading y (p,) minus the ``expected`` one (p,)."""
-        return np.asarray(self._function.difference(y, expected))
 
     def __call__(self, y: FloatArray, xhat: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the reading ``y`` (p,) linearised at the estimate ``xhat`` (n,), and H (p, n)."""
@@ -177,6 +167,10 @@ class MovedReadings:
         self._path, self._believed = path, believed
         self._at_samples = None if times is None else believed.states(times)
 
+    def __getattr__(self, name: str) -> Any:
+        """Return what no origin changes, such as covariances of readings."""
+        return getattr(self.__dict__["_path"], name)
+
     def _m(self, numbers: Sequence[int]) -> FloatArray:
         if self._at_samples is None:
             return self._believed.states(np.array(numbers))
@@ -193,24 +187,15 @@ class MovedReadings:
         """
         m = self._m([k])[0]
         if self._at_samples is None:
-            y, H = self._path.reading(k, x + m), self._path.matrix(k)
-            return _moved(y, H, m)
+            return moved_reading(self._path.reading(k, x + m), self._path.matrix(k), m)[0]
         y, H = self._path.reading(k, x + m)
         return moved_reading(y, H, m)
-
-    def covariance(self, k: int, R: FloatArray) -> FloatArray:
-        """Return the covariance of reading number ``k``, see ``covariance_of``."""
-        return covariance_of(self._path, k, R)
 
     def parts(self, slot: int, x: FloatArray, R: FloatArray) -> Iterator[Any]:
         """Yield y, H and covariance of each reading of a slot, see ``readings_of``."""
         m = self._m([slot])[0]
         for y, H, covariance in readings_of(self._path, slot, x + m, R):
             yield *moved_reading(y, H, m), covariance
-
-    def readings_at(self, slot: int, R: FloatArray) -> Any:
-        """Return the readings of a nonlinear sensor in a slot, which no origin changes."""
-        return self._path.readings_at(slot, R)
 
     def several(self, numbers: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return readings (S, p) and H (S, p, n) of increasing ``numbers``, states x (S, n)."""
@@ -230,9 +215,7 @@ def moved_reading(y: FloatArray, H: Any, m: FloatArray) -> tuple[FloatArray, Any
     """Return a reading y (p,) with H (p, n), or a function that linearises it, for states that are
     counted from ``m`` (n,).
     """
-    return _moved(y, H, m), H if isinstance(H, np.ndarray) else MovedFunction(H, m)
-
-
-def _moved(y: FloatArray, H: Any, m: FloatArray) -> FloatArray:
+    if not isinstance(H, np.ndarray):
+        return y, MovedFunction(H, m)
     # A sensor without a reading may give an empty y, whatever H is.
-    return y - H @ m if isinstance(H, np.ndarray) and len(H) == len(y) else y
+    return y - H @ m if len(H) == len(y) else y, H

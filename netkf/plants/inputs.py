@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
+import scipy
 
 from netkf.core.csv_files import Columns, read_columns, read_header
 from netkf.core.errors import ScenarioError
@@ -40,6 +41,15 @@ class Exogenous(NamedTuple):
     def last(self, times: FloatArray) -> np.ndarray:
         """Return the index (K,) of the last a not after each of ``times`` (K,), -1 if none is."""
         return np.asarray(np.searchsorted(self.times, times, side="right") - 1)
+
+    def states(self, times: FloatArray) -> FloatArray:
+        """Return ``e^{S (t - a)} z`` (K, q) at each of ``times`` (K,); 0 before the first a."""
+        last = self.last(times)
+        states = self.z[last]
+        if self.S.any():
+            gaps = (times - self.times[last])[:, None, None]
+            states = (scipy.linalg.expm(gaps * self.S) @ states[:, :, None])[:, :, 0]
+        return np.where(last[:, None] >= 0, states, 0.0)
 
 
 @dataclass(frozen=True, eq=False)

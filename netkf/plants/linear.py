@@ -257,10 +257,7 @@ class Blocks:
 
     def draw(self) -> FloatArray:
         """Return the next vector (size,)."""
-        if self._used == len(self._drawn):
-            self._drawn, self._used = self._random.standard_normal((BLOCK, self._size)), 0
-        self._used += 1
-        return np.asarray(self._drawn[self._used - 1])
+        return np.asarray(self.draws(1)[0])
 
     def draws(self, count: int) -> FloatArray:
         """Return the next vectors (count, size)."""

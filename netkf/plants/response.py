@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
-import scipy
 
 from netkf.core.instants import TimeGrid
 from netkf.linalg.arrays import FloatArray
@@ -68,10 +67,7 @@ class FlowResponse:
         # The input begins anew, as it is, where the plant changes.
         added = np.setdiff1d(changes, times)
         if len(added):
-            last = u.exogenous.last(added)
-            gaps = (added - times[last])[:, None, None]
-            moved = scipy.linalg.expm(gaps * S) @ z[last][:, :, None]
-            z = np.concatenate([z, np.where(last[:, None] >= 0, moved[:, :, 0], 0.0)])
+            z = np.concatenate([z, u.exogenous.states(added)])
             times = np.concatenate([times, added])
             z, times = z[np.argsort(times)], np.sort(times)
         self._exogenous, self.jumps = Exogenous(times, S, C, z), times

@@ -84,10 +84,6 @@ class RecordedSampling(Clock):
         """Ids of all nodes in the table."""
         return tuple(sorted({node for node, _ in self.row_times}))
 
-    def recorded_times(self, node: int) -> FloatArray:
-        """Return the increasing times (K,) in seconds at which a node samples."""
-        return self._times.get(node, np.empty(0))
-
     def ticks(
         self, entity: Entity, origin: float, index: int, now: float, random: Generator, count: int
     ) -> FloatArray:

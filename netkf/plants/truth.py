@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
 
@@ -27,30 +26,6 @@ from netkf.plants.transitions import Transitions
 from netkf.plants.tree import Tree
 
 TOLERANCE = 1e-9  # seconds by which a recorded time may be off
-
-
-class ContinuousTruth(Protocol):
-    """The state of one run, at sample times, probe times and frame times.
-
-    At a frame time the state is that after the rebase, so ``local`` is zero.
-    """
-
-    @property
-    def frame_times(self) -> FloatArray:
-        """(F,) increasing times in seconds, inside the run, at which the origin of states is moved
-        and a new frame begins; empty unless frames are used.
-        """
-
-    def local(self, time: float) -> FloatArray:
-        """Return x (n,) at ``time`` (seconds), relative to the origin of the present frame."""
-
-    def absolute(self, time: float) -> FloatArray:
-        """Return x (n,) at ``time`` (seconds), in the plant's coordinates."""
-
-    def rebase(self, k: int) -> FloatArray:
-        """Return the shift (n,) to subtract from estimates at ``frame_times[k]``: the local state
-        just before, to which the origin moves. The engine calls this once for each k, in order.
-        """
 
 
 def multiples(period: float | None, horizon: float, grid: TimeGrid) -> FloatArray:

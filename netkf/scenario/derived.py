@@ -518,8 +518,8 @@ class DerivedScenario(ScenarioModel):
     def continuous_truth(
         self, streams: Streams, frames: bool | None = None, sampled: FloatArray | None = None
     ) -> Any:
-        """Return the true state of a run, a plants.truth.ContinuousTruth, to be asked in increasing
-        order for sample, probe and frame times.
+        """Return the true state of a run, see ``plants.truth``, to be asked in increasing order for
+        sample, probe and frame times.
 
         ``frames``, by default ``exact_errors``: local states are relative to an origin that moves.
         ``sampled`` (K,) are sample times in seconds if drawn. Raises ScenarioError if a recorded

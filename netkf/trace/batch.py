@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -73,12 +73,18 @@ class BatchSink(Sink):
 
     def __init__(self, replicas: range, times: FloatArray, shape: tuple[int, int, int]) -> None:
         (filters, n, width), count = shape, (len(replicas), len(times))
-        self._replicas, self._times, self._filters = replicas, times, filters
-        self._x = np.full((*count, n), np.nan)
-        self._xhat, self._error = (np.full((*count, filters, width), np.nan) for _ in range(2))
-        self._P = np.full((*count, filters, width, width), np.nan)
-        self._lengths = np.zeros(len(replicas), dtype=np.int64)
-        self._counts = np.zeros((len(replicas), len(KINDS)), dtype=np.int64)
+        self._filters = filters
+        self._batch = RunBatch(
+            replicas=replicas,
+            times=times,
+            x=np.full((*count, n), np.nan),
+            xhat=np.full((*count, filters, width), np.nan),
+            P=np.full((*count, filters, width, width), np.nan),
+            error=np.full((*count, filters, width), np.nan),
+            lengths=np.zeros(len(replicas), dtype=np.int64),
+            counts=np.zeros((len(replicas), len(KINDS)), dtype=np.int64),
+            status=np.empty(0),
+        )
         self._status: list[str] = []
         self._sums: list[dict[str, tuple[float, float]]] = []
         self._hash, self._fingerprint = Fingerprint(), ""
@@ -92,14 +98,14 @@ class BatchSink(Sink):
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
         """Append K samples to those of the present run."""
-        run = len(self._status)
-        first, last = self._lengths[run], self._lengths[run] + len(t)
-        self._x[run, first:last] = x
+        run, batch = len(self._status), self._batch
+        first, last = batch.lengths[run], batch.lengths[run] + len(t)
+        batch.x[run, first:last] = x
         # A pooled filter is recorded once for every node.
-        self._xhat[run, first:last] = xhat[:, : self._filters]
-        self._P[run, first:last] = P[:, : self._filters]
-        self._error[run, first:last] = error[:, : self._filters]
-        self._lengths[run] = last
+        batch.xhat[run, first:last] = xhat[:, : self._filters]
+        batch.P[run, first:last] = P[:, : self._filters]
+        batch.error[run, first:last] = error[:, : self._filters]
+        batch.lengths[run] = last
 
     def finish(self, recorder: Recorder, status: str) -> None:
         """End the present run, with the counts and sums of its recorder and its ``status``
@@ -108,21 +114,14 @@ class BatchSink(Sink):
         # A batch has the fingerprint of its first run only.
         if not self._status and not recorder.counts_only:
             self._fingerprint = str(self._hash)
-        self._counts[len(self._status)] = recorder.counts
+        self._batch.counts[len(self._status)] = recorder.counts
         self._status.append(status)
         self._sums.append(recorder.sums)
 
     def batch(self) -> RunBatch:
         """Return the samples and counts of all runs, once each of them is finished."""
-        return RunBatch(
-            replicas=self._replicas,
-            times=self._times,
-            x=self._x,
-            xhat=self._xhat,
-            P=self._P,
-            error=self._error,
-            lengths=self._lengths,
-            counts=self._counts,
+        return replace(
+            self._batch,
             status=np.array(self._status),
             sums={name: np.array([sums[name] for sums in self._sums]) for name in self._sums[0]},
             exact_errors=self.exact_errors,

@@ -246,9 +246,9 @@ def test_a_reading_of_which_a_row_is_missing_is_compared_with_the_rest(tmp_path)
     slot = Exchange(phase=0, step=0, slot=1)
     after = algorithm.absorb(algorithm.update(state, Reading(y, H, R)), [], slot)
     cov = scenario.initial_estimate(node)[1]
-    matrices = model.F[None], model.Q[None]
-    gains = gain_sequence(matrices, info.network, cov, np.empty(0)).at(1)[node]
-    G = info.network.information.sum(axis=0)
+    matrices, network = (model.F[None], model.Q[None], cov), info.network
+    gains = gain_sequence(*matrices, network.information, network.heard, ()).at(1)[node]
+    G = network.information.sum(axis=0)
     z = H.T @ np.linalg.inv(R) @ (y - H @ np.linalg.pinv(G, hermitian=True) @ state.pseudo)
     yhat = state.pseudo + gains.M @ z
     np.testing.assert_allclose(after.pseudo, yhat, rtol=1e-11)

@@ -100,7 +100,7 @@ def test_names_in_all_tables_and_fields_are_the_run_with_ids(named, tmp_path):
             ]
         }
     )
-    assert sampled.sensors[0].sampling.recorded_times(1).tolist() == [1.2, 3.0]
+    assert sampled.sensors[0].sampling.ticks((1,), 0.0, 0, 0.0, None, 9).tolist() == [1.2, 3.0]
 
 
 def test_addresses_that_look_like_numbers_are_names_and_messages_say_what_a_name_is(folder):
