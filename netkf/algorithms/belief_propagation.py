@@ -151,8 +151,7 @@ def predict(record: Any, h: int, run: Any) -> None:
     if record.keeps == 1:
         move_evidence(record, h, run)
     predict_estimate(run.model, run, record.xhat, record.root, h, h)
-    for i in range(n):
-        store(lanes, record.base, h, i, load(lanes, record.xhat, h, i))
+    copy_vector(lanes, run.size, record.base, h, record.xhat, h, True)
     set_growing(record, lanes, record.centre[h], record.base[h])
     if record.keeps == 0:
         # Relative to itself the prediction is [S^-1, 0] for P = S S'.

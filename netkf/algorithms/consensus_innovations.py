@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import Filter, NodeInfo
-from netkf.algorithms.kernels.estimates import transform_mean
+from netkf.algorithms.kernels.estimates import copy_vector, transform_mean
 from netkf.algorithms.kernels.run import absorb as nothing
 from netkf.algorithms.kernels.run import shift_product, shift_vector, write_innovation
 from netkf.algorithms.kernels.square_root import lower_root
@@ -288,8 +288,7 @@ def write_matvec(run: Any, matrix: FloatArray, x: FloatArray, k: int, out: Float
 @kernel
 def emit(record: Any, h: int, m: int, run: Any) -> None:
     """Send the estimate of the pseudo-state."""
-    for i in range(len(run.size)):
-        store(run.lanes, record.payload.pseudo, m, i, load(run.lanes, record.pseudo, h, i))
+    copy_vector(run.lanes, run.size, record.payload.pseudo, m, record.pseudo, h, True)
 
 
 @kernel
@@ -301,11 +300,7 @@ def absorb(record: Any, h: int, run: Any) -> None:
     lanes, n, x, y = run.lanes, len(run.size), record.xhat, record.pseudo
     t, corrected = record.table_row[run.slot - record.first_slot], run.moved_mean
     # The pseudo-innovation ``H' R^-1 (reading - H G^+ yhat)``.
-    for i in range(n):
-        total = spread(lanes, 0.0)
-        for j in range(n):
-            total += record.inverse[i, j] * load(lanes, y, h, j)
-        store(lanes, run.row, i, total)
+    write_matvec(run, record.inverse, y, h, run.row)
     write_innovation(run, run.row, run.gains)
     for i in range(n):
         total = load(lanes, y, h, i)

@@ -29,6 +29,7 @@ import numpy as np
 
 from netkf.algorithms.diffusion import DiffusionFilter, diffusion_filter_record
 from netkf.algorithms.filter import Filter, NodeInfo
+from netkf.algorithms.kernels.estimates import copy_vector
 from netkf.algorithms.kernels.information import add_reading_pair, copy_information_root, weigh_part
 from netkf.algorithms.kernels.intersection import (
     finish_lanes,
@@ -46,7 +47,7 @@ from netkf.core.errors import ScenarioError
 from netkf.core.fields import field, integer, one_of, positive
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import load, load_flags, select, spread, store
+from netkf.linalg.lanes import load_flags, select, spread
 
 MAX_STEPS = 10_000  # consensus has converged long before: a larger value is a mistake
 INFORMATION, MEASUREMENTS, HYBRID = "information", "measurements", "hybrid"
@@ -84,8 +85,7 @@ def begin_pairs(record: Any, h: int, run: Any) -> None:
 @kernel
 def emit_pairs(record: Any, h: int, m: int, run: Any) -> None:
     """Send the pairs of node ``h``, and the prediction to which they are relative."""
-    for i in range(len(run.size)):
-        store(run.lanes, record.payload.xhat, m, i, load(run.lanes, record.xhat, h, i))
+    copy_vector(run.lanes, run.size, record.payload.xhat, m, record.xhat, h, True)
     for k in range(len(record.shares)):
         copy_information_root(run.lanes, record.parts[h, k], record.payload.parts[m, k])
 

@@ -24,7 +24,7 @@ import numpy as np
 
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading, compiled_kernels
 from netkf.algorithms.intermittent import Intermittent
-from netkf.algorithms.kernels.estimates import update_by_row
+from netkf.algorithms.kernels.estimates import copy_vector, update_by_row
 from netkf.algorithms.kernels.run import absorb as nothing
 from netkf.algorithms.kernels.run import predict_estimate, shift_prior, use_reading
 from netkf.algorithms.kernels.triggers import NO_READING, silence_probability, weigh_news
@@ -92,8 +92,7 @@ def silence_whitening(weight: FloatArray) -> FloatArray:
 def predict_prior(record: Any, h: int, run: Any) -> None:
     """Predict node ``h``, and keep the prediction, to which news and silence refer."""
     predict_estimate(run.model, run, record.xhat, record.root, h, h)
-    for i in range(len(run.size)):
-        store(run.lanes, record.prior, h, i, load(run.lanes, record.xhat, h, i))
+    copy_vector(run.lanes, run.size, record.prior, h, record.xhat, h, True)
     store_flags(run.lanes, record.sent, h, spread(run.lanes, 0.0) > 0.0)
 
 

@@ -22,6 +22,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from netkf.algorithms.filter import Filter, NodeInfo
+from netkf.algorithms.kernels.estimates import copy_vector
 from netkf.algorithms.kernels.pair_fusion import fuse_pair
 from netkf.algorithms.kernels.run import (
     carry,
@@ -42,7 +43,6 @@ from netkf.algorithms.traits import Analysis, Needs, Timing
 from netkf.core.fields import field, one_of
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import load, store
 from netkf.linalg.small import copy_matrix
 
 TRACE, DETERMINANT = "trace", "determinant"
@@ -174,8 +174,7 @@ def update_track(record: Any, h: int, run: Any) -> None:
 @kernel
 def emit_track(record: Any, h: int, m: int, run: Any) -> None:
     """Send the own track; all nodes know the sensors."""
-    for i in range(len(run.size)):
-        store(run.lanes, record.payload.xhat, m, i, load(run.lanes, record.track_x, h, i))
+    copy_vector(run.lanes, run.size, record.payload.xhat, m, record.track_x, h, True)
 
 
 @kernel

@@ -63,7 +63,7 @@ class LocalPool(Pool):
             self._size = min(2 * job.size, MAX_BLOCK_HERE)
 
 
-class AdaptivePool(LocalPool):
+class AdaptivePool(Pool):
     """A pool that runs blocks in this process until worker processes would save time for the rest.
 
     An ``open_ended`` pool, which serves one job after another, expects as much work to come as it
@@ -72,40 +72,34 @@ class AdaptivePool(LocalPool):
 
     def __init__(self, workers: int, open_ended: bool = False) -> None:
         self.width, self._open_ended = workers, open_ended
-        self._processes: ProcessPool | None = None
+        self._present: Pool = LocalPool()
         self._begun, self._seconds, self._runs, self._spent = False, 0.0, 0, 0.0
 
     @property
-    def ahead(self) -> int:  # type: ignore[override]
+    def ahead(self) -> int:
         """One block in this process, several for worker processes."""
-        return 1 if self._processes is None else self._processes.ahead
+        return self._present.ahead
 
     def begin(self, scenario: object) -> None:
         """Forget the times of another scenario, which say nothing about this one."""
         if scenario is not self._scenario:
             self._begun, self._seconds, self._runs = False, 0.0, 0
         super().begin(scenario)
-        if self._processes is not None:
-            self._processes.begin(scenario)
+        self._present.begin(scenario)
 
     def submit(self, job: Job) -> Future[BlockResult]:
         """Run the block in this process, or submit it to workers once that would save time."""
-        if self._processes is None and self._worth_processes(job):
-            self._processes = ProcessPool(self.width)
-        return super().submit(job) if self._processes is None else self._processes.submit(job)
+        if isinstance(self._present, LocalPool) and self._worth_processes(job):
+            self._present = ProcessPool(self.width)
+        return self._present.submit(job)
 
     def next_size(self, left: int) -> int:
         """Return the size of the next block: small here, larger for worker processes."""
-        if self._processes is None:
-            return super().next_size(left)
-        return self._processes.next_size(left)
+        return self._present.next_size(left)
 
     def note_duration(self, job: Job, seconds: float) -> None:
         """Add the ``seconds`` of a block to the estimate for a run; not those that fill caches."""
-        if self._processes is not None:
-            self._processes.note_duration(job, seconds)
-            return
-        super().note_duration(job, seconds)
+        self._present.note_duration(job, seconds)
         self._spent += seconds
         if self._begun or seconds > 1.0:
             self._seconds += seconds
@@ -122,12 +116,11 @@ class AdaptivePool(LocalPool):
 
     def wait(self, futures: Collection[Future[BlockResult]]) -> Collection[Future[BlockResult]]:
         """Wait until one of the futures is done; return all that are."""
-        return super().wait(futures) if self._processes is None else self._processes.wait(futures)
+        return self._present.wait(futures)
 
     def close(self, at_once: bool) -> None:
         """End the processes, if any were started."""
-        if self._processes is not None:
-            self._processes.close(at_once)
+        self._present.close(at_once)
 
 
 class ExecutorPool(RemotePool):

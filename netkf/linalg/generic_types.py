@@ -94,29 +94,6 @@ def _arrays_of(context: Any, builder: Any, struct: StructType, address: Any) -> 
 
 
 @intrinsic
-def _copy_row(_: Any, struct: StructType, k: Any, m: Any) -> Any:
-    """Type and emit the copy of entry m to entry k of all arrays."""
-
-    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        to, source = (
-            context.cast(builder, arg, kind, types.intp)
-            for arg, kind in zip(args[1:], sig.args[1:], strict=True)
-        )
-        for data, _, stride in _arrays_of(context, builder, sig.args[0], args[0]):
-            target = builder.gep(data, [builder.mul(to, stride)])
-            origin = builder.gep(data, [builder.mul(source, stride)])
-            cgutils.raw_memcpy(builder, target, origin, stride, 1)
-        return context.get_dummy_value()
-
-    return types.none(struct, k, m), emit
-
-
-@overload(copy_row, inline="always")
-def _overload_copy_row(struct, k, m):  # noqa: ANN001, ANN202, ARG001
-    return lambda struct, k, m: _copy_row(struct, k, m)  # noqa: PLW0108
-
-
-@intrinsic
 def _copy_part(_: Any, struct: StructType, k: Any, m: Any, place: Any, origin: Any, w: Any) -> Any:
     """Type and emit the copy of a component of entry m to one of entry k of all arrays."""
 
@@ -136,6 +113,11 @@ def _copy_part(_: Any, struct: StructType, k: Any, m: Any, place: Any, origin: A
         return context.get_dummy_value()
 
     return types.none(struct, k, m, place, origin, w), emit
+
+
+@overload(copy_row, inline="always")
+def _overload_copy_row(struct, k, m):  # noqa: ANN001, ANN202, ARG001
+    return lambda struct, k, m: _copy_part(struct, k, m, 0, 0, 1)
 
 
 @overload(copy_part, inline="always")

@@ -20,7 +20,8 @@ from netkf.linalg.compiling import kernel
 from netkf.linalg.functions import call_function
 from netkf.linalg.lanes import Lanes, load, spread, store
 from netkf.linalg.small import count_until
-from netkf.rng.numbers import NormalZiggurat, next_normal
+from netkf.rng.draws import Ziggurat
+from netkf.rng.numbers import next_normal
 
 
 class Path(NamedTuple):
@@ -45,7 +46,7 @@ def draw_normals(
     first: int,
     stride: int,
     runs: int,
-    ziggurat: NormalZiggurat,
+    ziggurat: Ziggurat,
     normals: FloatArray,
     count: int,
 ) -> None:
@@ -62,7 +63,7 @@ def draw_normals(
 def draw_starts(
     lanes: Lanes,
     states: np.ndarray,
-    ziggurat: NormalZiggurat,
+    ziggurat: Ziggurat,
     mean: FloatArray,
     root: FloatArray,
     scratch: FloatArray,
@@ -136,7 +137,7 @@ def draw_paths(
     lanes: Lanes,
     path: Path,
     states: np.ndarray,
-    ziggurat: NormalZiggurat,
+    ziggurat: Ziggurat,
     slot: int,
     scratch: FloatArray,
     local: FloatArray,
@@ -189,7 +190,7 @@ def draw_map_paths(
     lanes: Lanes,
     path: MapPaths,
     states: np.ndarray,
-    ziggurat: NormalZiggurat,
+    ziggurat: Ziggurat,
     slot: int,
     scratch: FloatArray,
     out: FloatArray,
@@ -247,7 +248,7 @@ def draw_readings(
     lanes: Lanes,
     sensors: SlotSensors,
     states: np.ndarray,
-    ziggurat: NormalZiggurat,
+    ziggurat: Ziggurat,
     x: FloatArray,
     regressors: FloatArray,
     scratch: FloatArray,

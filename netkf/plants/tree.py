@@ -24,7 +24,8 @@ from netkf.linalg.local import local_vector
 from netkf.linalg.portable import apply, norm, product
 from netkf.linalg.structs import MAX_UNROLLED, Size, sized
 from netkf.plants.transitions import Transitions, noise_factors
-from netkf.rng.numbers import NormalZiggurat, first_normals, normal_ziggurat
+from netkf.rng.draws import Ziggurat
+from netkf.rng.numbers import first_normals, normal_ziggurat
 from netkf.rng.streams import BLOCK_WORDS, USED
 
 MAX_TICKS = 1e15  # ticks of the finest cells up to the horizon
@@ -146,7 +147,7 @@ def draw_normals_of_point(
     stream: np.ndarray,
     first: int,
     second: int,
-    ziggurat: NormalZiggurat,
+    ziggurat: Ziggurat,
     out: FloatArray,
     begin: int,
 ) -> None:
@@ -166,7 +167,7 @@ def fill_states(
     ticks: IntArray,
     stream: np.ndarray,
     every: int,
-    ziggurat: NormalZiggurat,
+    ziggurat: Ziggurat,
     walk: Walk,
     states: FloatArray,
     offsets: FloatArray,
@@ -204,7 +205,7 @@ def fill_states(
 
 @kernel
 def enter_knot(
-    size: Size, cells: Cells, stream: np.ndarray, knot: int, ziggurat: NormalZiggurat, walk: Walk
+    size: Size, cells: Cells, stream: np.ndarray, knot: int, ziggurat: Ziggurat, walk: Walk
 ) -> None:
     """Make the cell after number ``knot`` of the knots the first of the ``walk``."""
     kind = len(cells.length) - 1

@@ -36,10 +36,10 @@ EXPONENTIAL_TAIL = 7.69711747013104972  # where numpy's exponential ziggurat beg
 
 
 class Ziggurat(NamedTuple):
-    """The 256 layers of the ziggurat under exp(-x), (256,) each.
+    """The 256 layers of a ziggurat under a curve, exp(-x) or exp(-x^2 / 2), (256,) each.
 
-    height  exp(-x) at the edge of the layer
-    width   x at the edge, divided by 2^53
+    height  of the curve at the edge of the layer
+    width   x at the edge, divided by 2^53, or 2^52 under exp(-x^2 / 2)
     inside  integers below this are inside the curve without a test
     """
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
+from netkf.rng.draws import Ziggurat
+from netkf.rng.numbers import next_normal, normal_ziggurat
 
 
 class Normals(Protocol):
@@ -46,7 +47,7 @@ class StreamNormals:
 
 
 @kernel
-def fill_normals_of_all(states: np.ndarray, ziggurat: NormalZiggurat, out: FloatArray) -> None:
+def fill_normals_of_all(states: np.ndarray, ziggurat: Ziggurat, out: FloatArray) -> None:
     """Write the next M standard normal numbers of stream k of the ``states`` (K, WIDTH) into
     ``out[k]``, for all k; ``out`` is (K, M).
     """

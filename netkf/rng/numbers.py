@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -32,30 +32,17 @@ INVERSE_TAIL_START = 0.27366123732975827203338247596
 HAS_HALF = _U(1 << 32)  # added to the half of a word that a state keeps
 
 
-class NormalZiggurat(NamedTuple):
-    """The 256 layers of the ziggurat under exp(-x^2 / 2), (256,) each.
-
-    height  exp(-x^2 / 2) at the edge of the layer
-    width   x at the edge, divided by 2^52
-    inside  integers below this are inside the curve without a test
-    """
-
-    height: FloatArray
-    width: FloatArray
-    inside: np.ndarray
-
-
 @cache
-def normal_ziggurat() -> NormalZiggurat:
+def normal_ziggurat() -> Ziggurat:
     """Return the 256 layers of numpy's ziggurat for standard normal numbers, loaded once; "fi",
     "wi" and "ki" are numpy's names of heights, widths and inside limits.
     """
     with np.load(Path(__file__).with_name("ziggurat_normal.npz")) as tables:
-        return NormalZiggurat(tables["fi"], tables["wi"], tables["ki"])
+        return Ziggurat(tables["fi"], tables["wi"], tables["ki"])
 
 
 @kernel(inlined=True)
-def layer_normal(word: Any, ziggurat: NormalZiggurat) -> tuple[float, int, Any, bool]:
+def layer_normal(word: Any, ziggurat: Ziggurat) -> tuple[float, int, Any, bool]:
     """Return the normal number x that a 64-bit ``word`` makes, its layer and its integer across the
     layer, and whether it is inside the curve; else x is not accepted without a test.
     """
@@ -68,7 +55,7 @@ def layer_normal(word: Any, ziggurat: NormalZiggurat) -> tuple[float, int, Any, 
 
 
 @kernel
-def next_normal(states: np.ndarray, k: int, ziggurat: NormalZiggurat) -> float:
+def next_normal(states: np.ndarray, k: int, ziggurat: Ziggurat) -> float:
     """Return the next standard normal number of stream ``k`` of the ``states`` (K, WIDTH)."""
     while True:
         x, layer, size, is_inside = layer_normal(next_word(states, k), ziggurat)
@@ -84,7 +71,7 @@ def next_normal(states: np.ndarray, k: int, ziggurat: NormalZiggurat) -> float:
 
 @kernel
 def next_gamma(
-    states: np.ndarray, k: int, shape: float, exponential: Ziggurat, normal: NormalZiggurat
+    states: np.ndarray, k: int, shape: float, exponential: Ziggurat, normal: Ziggurat
 ) -> float:
     """Return the next number of stream ``k`` of the ``states`` (K, WIDTH) from the gamma law of
     this ``shape`` > 0 and scale 1.
@@ -119,7 +106,7 @@ def next_gamma(
 
 @kernel(inlined=True)
 def first_normals(
-    size: Size, states: np.ndarray, k: int, ziggurat: NormalZiggurat, out: FloatArray, begin: int
+    size: Size, states: np.ndarray, k: int, ziggurat: Ziggurat, out: FloatArray, begin: int
 ) -> None:
     """Write the first n standard normals of stream ``k``, of which nothing was drawn (its words 0
     and USED are 0 and BLOCK_WORDS), into ``out`` from ``begin`` on; ``size`` has the length n.

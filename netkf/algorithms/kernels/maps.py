@@ -18,7 +18,6 @@ from netkf.algorithms.kernels.run import (
     carry_in_slot,
     carry_mean,
     carry_mean_in_slot,
-    predict_copy,
     predict_estimate,
     transition,
     update_estimate,
@@ -107,9 +106,11 @@ class SingleMapRun(Struct):
     __annotations__ = SlotRun.__annotations__
 
 
-@predict_copy.register(MapTables)
+@predict_estimate.register(MapTables)
 @kernel
-def predict_by_map(model: MapTables, run: Any, x: FloatArray, root: FloatArray, k: int) -> None:
+def predict_by_map(
+    model: MapTables, run: Any, x: FloatArray, root: FloatArray, k: int, _h: int
+) -> None:
     """Predict estimate ``k`` by one slot."""
     slot = run.slot - model.delay
     move_estimate(model, run.size, run.lanes, x, root, k, slot, (run.moved, run.noise))
@@ -224,14 +225,6 @@ def set_point(
         out[i] = x[k, i, q]
         if r > 0 and i >= column:
             out[i] += step * root[k, i, column, q]
-
-
-@predict_estimate.register(MapTables)
-@kernel(inlined=True)
-def _predict_own_by_map(
-    model: MapTables, run: Any, x: FloatArray, root: FloatArray, k: int, _h: int
-) -> None:
-    predict_by_map(model, run, x, root, k)
 
 
 @transition.register(MapTables)

@@ -21,7 +21,6 @@ from netkf.algorithms.kernels.run import (
     SlotRun,
     carry,
     carry_mean,
-    predict_copy,
     predict_estimate,
     transition,
     update_estimate,
@@ -208,18 +207,12 @@ def _write_noise_root(model: RateTables, n: int, first: int) -> None:
             work[i, column + j] = total / math.sqrt(pivot)
 
 
-@predict_copy.register(RateTables)
-@kernel
-def predict_by_rate(model: RateTables, run: Any, x: FloatArray, root: FloatArray, k: int) -> None:
-    """Predict estimate ``k`` over ``run.gap`` to ``run.now``."""
-    move_by_rate(model, x, root, k, run.now, run.gap)
-
-
 @predict_estimate.register(RateTables)
 @kernel
-def _predict_own_by_rate(
+def predict_by_rate(
     model: RateTables, run: Any, x: FloatArray, root: FloatArray, k: int, _h: int
 ) -> None:
+    """Predict estimate ``k`` over ``run.gap`` to ``run.now``."""
     move_by_rate(model, x, root, k, run.now, run.gap)
 
 

@@ -312,21 +312,23 @@ def _transition_of_gap(
             out[i, c, 0] = model.mean[0, i]
 
 
-@predict_copy.register(SlotModelArrays)
+@predict_copy.register(Struct)
 @kernel(inlined=True)
-def predict_slot(model: SlotModelArrays, run: Any, x: FloatArray, root: FloatArray, k: int) -> None:
-    """Predict by one slot: ``x <- F x``, ``P <- F P F' + Q``."""
-    F = model.F
-    transform_mean(run.lanes, run.size, x, k, F, run.moved_mean)
-    transform_root(run.lanes, run.size, root, k, F, model.root_Q, (run.moved, run.noise))
+def _predict_without_readings(
+    model: Any, run: Any, x: FloatArray, root: FloatArray, k: int
+) -> None:
+    predict_estimate(model, run, x, root, k, 0)
 
 
 @predict_estimate.register(SlotModelArrays)
 @kernel(inlined=True)
-def _predict_in_slot(
+def predict_slot(
     model: SlotModelArrays, run: Any, x: FloatArray, root: FloatArray, k: int, _h: int
 ) -> None:
-    predict_slot(model, run, x, root, k)
+    """Predict by one slot: ``x <- F x``, ``P <- F P F' + Q``."""
+    F = model.F
+    transform_mean(run.lanes, run.size, x, k, F, run.moved_mean)
+    transform_root(run.lanes, run.size, root, k, F, model.root_Q, (run.moved, run.noise))
 
 
 @carry.register(SlotModelArrays)

@@ -19,6 +19,7 @@ from netkf.algorithms.kernels.root_flow import cholesky_in_lanes
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import ONE
+from netkf.linalg.small import multiply_square
 from netkf.linalg.structs import Struct
 
 NEGLIGIBLE = 1e-12
@@ -80,12 +81,7 @@ def multiply_both(left: FloatArray, P: FloatArray, right: FloatArray, work: Floa
     """
     n = len(P)
     # work = left P, complete before P changes; then P = work right'.
-    for a in range(n):
-        for c in range(n):
-            total = 0.0
-            for m in range(n):
-                total += left[a, m] * P[m, c]
-            work[a, c] = total
+    multiply_square(P[0], work, left, P)
     for a in range(n):
         for c in range(n):
             total = 0.0

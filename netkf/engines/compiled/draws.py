@@ -19,8 +19,9 @@ from netkf.plants.diffusion import NO_TIMES
 from netkf.plants.laws import course_width
 from netkf.plants.paths import BLOCK, StepBlock
 from netkf.plants.sensors import step_noise
+from netkf.rng.draws import Ziggurat
 from netkf.rng.normals import StreamNormals
-from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
+from netkf.rng.numbers import next_normal, normal_ziggurat
 from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.model import PlacedSensor
 from netkf.scenario.scenario import Scenario
@@ -228,7 +229,7 @@ class Noise:
 def fill_noise(
     states: np.ndarray,
     rows: np.ndarray,
-    ziggurat: NormalZiggurat,
+    ziggurat: Ziggurat,
     scales: FloatArray,
     out: FloatArray,
 ) -> None:

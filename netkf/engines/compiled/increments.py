@@ -12,7 +12,8 @@ from netkf.linalg.lanes import ONE
 from netkf.linalg.small import copy_matrix
 from netkf.plants.paths import fill_course, fill_state_moments
 from netkf.plants.sensors import divide, fill_reading
-from netkf.rng.numbers import NormalZiggurat, next_normal
+from netkf.rng.draws import Ziggurat
+from netkf.rng.numbers import next_normal
 
 
 @kernel
@@ -48,7 +49,7 @@ def noise_index(sensing: Sensing, run: int, s: int, step: int) -> int:
 @kernel
 def draw_cut(sensing: Sensing, run: int, s: int, normals: FloatArray) -> None:
     """Draw the ``normals`` (2, p) that divide the noise of sensor ``s`` inside a step."""
-    ziggurat = NormalZiggurat(sensing.height, sensing.width, sensing.inside)
+    ziggurat = Ziggurat(sensing.height, sensing.width, sensing.inside)
     states, stream = sensing.cuts, run * len(sensing.rows) + s
     for half in range(2):
         for i in range(sensing.rows[s]):

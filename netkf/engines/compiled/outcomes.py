@@ -54,7 +54,7 @@ from netkf.network.losses import (
 from netkf.network.radio import Airtime
 from netkf.network.scheduled import ScheduledLoss
 from netkf.rng.draws import Ziggurat, next_exponential, next_unit, ziggurat
-from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
+from netkf.rng.numbers import next_normal, normal_ziggurat
 from netkf.rng.streams import WIDTH, ReplicaStreams, Streams
 from netkf.scenario.model import Network
 from netkf.scenario.scenario import Scenario
@@ -119,7 +119,7 @@ class ChannelStreams(NamedTuple):
     width: float
     bits: bool
     exponential: Ziggurat
-    normal: NormalZiggurat
+    normal: Ziggurat
     listed: FloatArray
     following: IntArray
 

@@ -25,8 +25,8 @@ from netkf.network.clocks import LinkClock
 from netkf.plants import sampling
 from netkf.plants.readings import read_many
 from netkf.plants.sensors import LinearSensor
-from netkf.rng.draws import ziggurat
-from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
+from netkf.rng.draws import Ziggurat, ziggurat
+from netkf.rng.numbers import next_normal, normal_ziggurat
 from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.model import PlacedSensor
 from netkf.scenario.sampling import all_sample_times
@@ -173,7 +173,7 @@ class KernelSamples:
 @kernel(allocates=True)
 def draw_samples(
     noise: np.ndarray,
-    ziggurat: NormalZiggurat,
+    ziggurat: Ziggurat,
     first: int,
     stream: IntArray,
     rows: IntArray,

@@ -36,7 +36,7 @@ from netkf.linalg.compiling import kernel
 from netkf.network.clocks import LinkClock, Periodic, Poisson, RecordedClock, Renewal
 from netkf.network.losses import Transmission, law_in_kernels
 from netkf.rng.draws import Ziggurat, fill_units, next_exponential, next_unit, ziggurat
-from netkf.rng.numbers import NormalZiggurat, next_gamma, normal_ziggurat
+from netkf.rng.numbers import next_gamma, normal_ziggurat
 from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.positions import ticks_of
 from netkf.scenario.scenario import Scenario
@@ -140,7 +140,7 @@ def draw_ticks(
 
 @kernel(inlined=True)
 def tick_after(
-    clocks: Clocks, k: int, now: float, exponential: Ziggurat, normal: NormalZiggurat
+    clocks: Clocks, k: int, now: float, exponential: Ziggurat, normal: Ziggurat
 ) -> float:
     """Return the time of the tick of entity ``k`` after that at ``now`` (seconds), off the grid."""
     if clocks.kind == EXPONENTIAL_GAPS:
@@ -164,7 +164,7 @@ def tick_after(
 
 
 @kernel
-def start_clocks(clocks: Clocks, exponential: Ziggurat, normal: NormalZiggurat) -> None:
+def start_clocks(clocks: Clocks, exponential: Ziggurat, normal: Ziggurat) -> None:
     """Draw the first tick of each entity."""
     for k in range(len(clocks.next_tick)):
         clocks.next_tick[k] = tick_after(clocks, k, 0.0, exponential, normal)
@@ -435,7 +435,7 @@ def draw_instants(
     clocks: Clocks,
     horizon: float,
     exponential: Ziggurat,
-    normal: NormalZiggurat,
+    normal: Ziggurat,
     t: FloatArray,
     entity: IntArray,
 ) -> int:

@@ -383,13 +383,8 @@ def support(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike, depth: int) 
     roots = covariance_root(steady_covariance(F, Q, H, R))[None]
     root_Q, modes = square_root(Q), reading_modes([(H[:0], R[:0, :0]), (H, R)], len(F))
     for _ in range(depth):
-        one_slot_modes = (
-            np.zeros((len(roots), 1), dtype=np.uint8),
-            np.ones((len(roots), 1), dtype=np.uint8),
-        )
-        roots = np.concatenate(
-            [move_roots(roots, mode, F, root_Q, modes) for mode in one_slot_modes]
-        )
+        one_slot = (np.full((len(roots), 1), mode, dtype=np.uint8) for mode in (0, 1))
+        roots = np.concatenate([move_roots(roots, mode, F, root_Q, modes) for mode in one_slot])
     return symmetric(roots @ np.swapaxes(roots, -1, -2))
 
 

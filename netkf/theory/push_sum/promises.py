@@ -29,34 +29,22 @@ MAX_LEADER_SLOTS, AGREEMENT = 200, 0.99  # slots of an election; probability tha
 def slot_promises(scenario: Scenario) -> dict[str, Any]:
     """Return the results of P by name, each ``{"value", "reason"}``, one of them None."""
 
-    def limit() -> float:
-        return float(np.trace(push_sum_limits(scenario).P))
-
-    def central() -> float:
-        return float(np.trace(central_covariance(scenario)))
-
-    def by_node() -> list[float]:
-        covariance = push_sum_error_covariance(scenario)
-        return [float(trace) for trace in np.trace(covariance, axis1=1, axis2=2)]
-
     def cut() -> list[float]:
         probability = disconnection_probability(scenario)
         return [probability.low, probability.high]
 
-    def corollary() -> dict[str, float]:
-        """Return the gamma of Corollary 2, and what Theorem 5 says of it."""
-        return corollary_2(scenario)._asdict()
-
     functions: dict[str, Callable[[], Any]] = {
-        "limit_trace": limit,
-        "central_trace": central,
-        "error_traces": by_node,
+        "limit_trace": lambda: float(np.trace(push_sum_limits(scenario).P)),
+        "central_trace": lambda: float(np.trace(central_covariance(scenario))),
+        "error_traces": lambda: (
+            np.trace(push_sum_error_covariance(scenario), axis1=1, axis2=2).tolist()
+        ),
         "radius": lambda: push_sum_radius(scenario),
         "laplacian_radius": lambda: consensus_gain_bound(scenario).radius,
         "exact_minimum_gamma": lambda: _exact_gamma(scenario),
         "minimum_gamma_mean": lambda: minimum_gamma(scenario, "mean"),
         "minimum_gamma_mean_square": lambda: minimum_gamma(scenario, "mean-square"),
-        "corollary_2": corollary,
+        "corollary_2": lambda: corollary_2(scenario)._asdict(),
         "leader_slots": lambda: _leader_slots(scenario),
         "disconnection_probability": cut,
     }
