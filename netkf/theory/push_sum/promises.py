@@ -36,9 +36,9 @@ def slot_promises(scenario: Scenario) -> dict[str, Any]:
     functions: dict[str, Callable[[], Any]] = {
         "limit_trace": lambda: float(np.trace(push_sum_limits(scenario).P)),
         "central_trace": lambda: float(np.trace(central_covariance(scenario))),
-        "error_traces": lambda: (
-            np.trace(push_sum_error_covariance(scenario), axis1=1, axis2=2).tolist()
-        ),
+        "error_traces": lambda: np.trace(
+            push_sum_error_covariance(scenario), axis1=1, axis2=2
+        ).tolist(),
         "radius": lambda: push_sum_radius(scenario),
         "laplacian_radius": lambda: consensus_gain_bound(scenario).radius,
         "exact_minimum_gamma": lambda: _exact_gamma(scenario),
