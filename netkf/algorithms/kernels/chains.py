@@ -22,6 +22,7 @@ from netkf.algorithms.kernels.square_root import lower_triangular
 from netkf.linalg.arrays import FloatArray, as_kernel_array
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import ONE
+from netkf.linalg.small import copy_matrix
 
 FEW = 4096  # slots of all chains together, below which threads cost more than they save
 
@@ -134,6 +135,4 @@ def run_sequences(
                 rotate(ONE, size, roots, chain, row, gains)
             transform_root(ONE, size, roots, chain, F, root_Q, scratch)
             if paths.shape[1] > 0:
-                for i in range(n):
-                    for j in range(n):
-                        paths[chain, step, i, j] = roots[chain, i, j]
+                copy_matrix(paths[chain, step], roots[chain])

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.small import multiply_square
+from netkf.linalg.small import copy_matrix, multiply_square
 from netkf.linalg.structs import Size
 
 TERMS = 18  # of the exponential series: enough for a norm of at most 1/2
@@ -92,9 +92,7 @@ def double_gap(step: float, J_1: FloatArray, work: FloatArray) -> None:
         for j in range(n):
             J_1[i, j] += product[i, j]
     multiply_square(E, product, E, E)
-    for i in range(n):
-        for j in range(n):
-            E[i, j] = product[i, j]
+    copy_matrix(E, product)
 
 
 @kernel
@@ -127,9 +125,7 @@ def fill_inverse_transition(size: Size, A: FloatArray, gap: float, maps: FloatAr
         bound *= norm / k
     for _ in range(halvings):
         multiply_square(size, product, out, out)
-        for i in range(n):
-            for j in range(n):
-                out[i, j] = product[i, j]
+        copy_matrix(out, product)
 
 
 @kernel
