@@ -51,7 +51,8 @@ def network_figure(data: FigureData) -> Picture:
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes, (label, values) in zip(panels, quantities.items(), strict=True):
         draw_network(axes, data, values, label, positions)
-    panels[0].legend(loc="upper left", bbox_to_anchor=(0.0, 0.0), ncols=2)
+    # Below the names of the lowest nodes, which may hang over the rim of the panel.
+    panels[0].legend(loc="upper left", bbox_to_anchor=(0.0, 0.0), ncols=2, borderaxespad=1.8)
     return finish_figure(
         figure, data.title(_make_headline(data)), data.caption(*explain_network(data))
     )

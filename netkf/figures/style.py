@@ -154,6 +154,14 @@ def text_width(text: str, size: float, weight: str = "normal") -> float:
     return float(width)
 
 
+def lay_out(figure: Figure) -> None:
+    """Place all artists once, instead of in a first drawing of them that is thrown away."""
+    figure.set_dpi(RESOLUTION)
+    if (engine := figure.get_layout_engine()) is not None:
+        engine.execute(figure)
+        figure.set_layout_engine("none")
+
+
 def write_figure(figure: Figure, path: Path) -> None:
     """Write a figure, whole or not at all, in the format of its suffix; raises WriteError."""
     file_format = path.suffix.removeprefix(".").lower() or "png"
@@ -161,11 +169,7 @@ def write_figure(figure: Figure, path: Path) -> None:
     undated: dict[str, Any] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
     metadata = undated[file_format]
     with style_context(), write_atomically(path, this_process()) as temporary:
-        figure.set_dpi(RESOLUTION)
-        if (engine := figure.get_layout_engine()) is not None:
-            # Once, instead of in a first drawing of all artists that is thrown away.
-            engine.execute(figure)
-            figure.set_layout_engine("none")
+        lay_out(figure)
         if file_format == "png":
             # ``savefig`` would first draw all artists to nowhere.
             canvas: Any = FigureCanvasAgg(figure)

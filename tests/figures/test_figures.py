@@ -16,7 +16,7 @@ from netkf.figures.catalogue import FIGURES, FigureSet, plot_to_files
 from netkf.figures.names import FIGURE_NAMES
 from netkf.figures.outcomes import envelope_figure
 from netkf.figures.several import errors_figure
-from netkf.figures.style import style_context
+from netkf.figures.style import lay_out, style_context
 from netkf.runs.curves import ErrorCurve
 from netkf.studies.sweep import plan_sweep, sweep_to_directory
 from tests.conftest import SCENARIOS, with_slow
@@ -55,6 +55,7 @@ def shown_texts(figure):
 
 def assert_well_laid_out(figure):
     with style_context():
+        lay_out(figure)
         figure.draw_without_rendering()
     texts = shown_texts(figure)
     width, height = figure.bbox.width, figure.bbox.height
@@ -434,6 +435,17 @@ def test_the_legend_of_a_network_has_no_colour_of_a_node():
     figure = netkf.simulate(netkf.load(SCENARIOS / "poisson_ring.toml")).plot("network")
     legend = next(axes.get_legend() for axes in figure.axes if axes.get_legend())
     assert [line.get_markerfacecolor() for line in legend.get_lines()] == ["white", "white"]
+
+
+def test_the_names_of_the_lowest_nodes_stand_above_the_legend():
+    changes = {
+        "horizon": 1.0,
+        "network.graph": {"kind": "edges", "edges": [[0, 1], [1, 2], [2, 3]]},
+    }
+    figure = netkf.simulate(netkf.load(SCENARIOS / "poisson_ring.toml", changes)).plot("network")
+    assert_well_laid_out(figure)
+    legend = figure.axes[0].get_legend().get_window_extent()
+    assert all(text.get_window_extent().y0 >= legend.y1 for text in figure.axes[0].texts)
 
 
 def test_only_what_happened_stands_in_titles_and_on_axes():
