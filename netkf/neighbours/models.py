@@ -49,30 +49,17 @@ def from_control(
     Raises ScenarioError for what is no state space, matrices of the wrong shape, a feedthrough D
     with an input, and what ``netkf.load`` refuses.
     """
-    known = hasattr(system, "A") and hasattr(system, "C")
-    space = system
-    if not known and hasattr(system, "to_ss"):
-        with contextlib.suppress(TypeError):  # responses by frequency have no state
-            space = system.to_ss()
-    if not all(hasattr(space, name) for name in ("A", "B", "C", "D", "dt")):
-        remedy = "give control.ss(system), or one of scipy.signal.StateSpace"
-        raise ScenarioError("system", "must be a state space", type(system).__name__, remedy)
+    space = _as_space(system)
     A, C = (matrix(name, np.asarray(getattr(space, name))) for name in "AC")
     gain = np.eye(len(A)) if G is None else _shaped("G", matrix("G", np.atleast_2d(G)), len(A))
-    hint = "correct it" + ", or give G = system.B for noise at the inputs" * (G is None and known)
+    hint = "correct it"
+    if G is None and space is system:
+        hint += ", or give G = system.B for noise at the inputs"
     given = np.eye(gain.shape[1]) if Q is None else np.atleast_2d(Q)
     noise = _shaped("Q", covariance("Q", given), gain.shape[1], hint)
     named = str(getattr(system, "name", None) or "")
     table: dict[str, Any] = {"name": named if named and "[" not in named else "system"}
-    if space.dt is None or (space.dt == 0 and space.dt is not False):
-        root = noise_root(noise)
-        table["plant"] = {"kind": "diffusion", "A": A, "B": gain @ root}
-        fastest = float(np.abs(np.linalg.eigvals(A)).max()) or 1.0
-        table["horizon"] = decimal_below(TIME_CONSTANTS / fastest)
-        table["probe"] = float(Decimal(repr(table["horizon"])) / SAMPLES)
-    else:
-        table |= _slots(1.0 if space.dt is True else space.dt)
-        table["plant"] |= {"F": A, "Q": gain @ noise @ gain.T}
+    table |= _dynamics(space.dt, A, gain, noise)
     states = [str(label) for label in getattr(system, "state_labels", ())]
     if states and not any("[" in name for name in states):  # x[0], .. if nobody named them
         table["plant"]["states"] = states
@@ -82,6 +69,34 @@ def from_control(
         remedy = "subtract D u from the outputs and set D = 0"
         raise ScenarioError("system.D", rule, np.asarray(space.D), remedy)
     return scenario
+
+
+def _as_space(system: Any) -> Any:
+    """Return ``system`` as a state space; raises ScenarioError if it is none."""
+    space = system
+    if not (hasattr(system, "A") and hasattr(system, "C")) and hasattr(system, "to_ss"):
+        with contextlib.suppress(TypeError):  # responses by frequency have no state
+            space = system.to_ss()
+    if not all(hasattr(space, name) for name in ("A", "B", "C", "D", "dt")):
+        remedy = "give control.ss(system), or one of scipy.signal.StateSpace"
+        raise ScenarioError("system", "must be a state space", type(system).__name__, remedy)
+    return space
+
+
+def _dynamics(dt: Any, A: FloatArray, gain: FloatArray, noise: FloatArray) -> dict[str, Any]:
+    """Return plant, horizon and probe: in continuous time where ``dt`` is None or 0."""
+    if dt is None or (dt == 0 and dt is not False):
+        fastest = float(np.abs(np.linalg.eigvals(A)).max()) or 1.0
+        horizon = decimal_below(TIME_CONSTANTS / fastest)
+        plant = {"kind": "diffusion", "A": A, "B": gain @ noise_root(noise)}
+        return {
+            "plant": plant,
+            "horizon": horizon,
+            "probe": float(Decimal(repr(horizon)) / SAMPLES),
+        }
+    table = _slots(1.0 if dt is True else dt)
+    table["plant"] |= {"F": A, "Q": gain @ noise @ gain.T}
+    return table
 
 
 def from_filterpy(kf: Any, changes: Changes = None, *, period: float = 1.0) -> Scenario:
