@@ -166,7 +166,9 @@ def envelope_figure(table: Any) -> Picture:
         replay = float(own["replay"].iloc[0])
         axes.axvline(replay, color=INK, ls="--", lw=1.2, label="replay")
         outside = places[~own["inside"].astype(bool)]
-        style: dict[str, Any] = {"color": LOST, "ls": "", "mew": 1.6, "label": "replay outside"}
+        # The legend, which is that of the first panel, has it where any panel has.
+        label = "_" if table["inside"].all() else "replay outside"
+        style: dict[str, Any] = {"color": LOST, "ls": "", "mew": 1.6, "label": label}
         axes.plot(np.full(len(outside), replay), outside, "x", **style)
         axes.set_yticks(places, laws)
         axes.margins(x=0.12)

@@ -77,7 +77,8 @@ def stability_figure(data: FigureData) -> Picture:
         (stable, "o", RELAY, "the bound has a steady state"),
         (~stable, "x", LOST, "the bound grows without end"),
     ):
-        axes.plot(x[group], y[group], ls="", marker=marker, ms=9, color=colour, label=label)
+        if group.any():
+            axes.plot(x[group], y[group], ls="", marker=marker, ms=9, color=colour, label=label)
     delivery = float(loss.delivery)
     style: dict[str, Any] = {"marker": "*", "ls": "", "ms": 13, "mfc": "none", "mec": INK}
     axes.plot([rate], [delivery], label="this scenario", **style)

@@ -192,9 +192,12 @@ def links_figure(data: FigureData) -> Picture:
             drawn_times = times[times <= end]
             style: dict[str, Any] = {"ls": "", "marker": marker, "ms": size, "mew": 0.9}
             axes.plot(drawn_times, np.full(len(drawn_times), row), color=colour, **style)
-    # Empty series for the legend.
-    axes.plot([], [], "|", color=INK, label="delivered")
-    axes.plot([], [], "x", color=LOST, label="lost")
+    # Empty series for the legend, of what there is.
+    outcomes = heard(np.concatenate(selection))
+    if outcomes.any():
+        axes.plot([], [], "|", color=INK, label="delivered")
+    if not outcomes.all():
+        axes.plot([], [], "x", color=LOST, label="lost")
     labels = [" to ".join(_end_names(data, one)) for one in selection]
     axes.set_yticks(range(len(selection)), labels, fontsize=6.5)
     axes.set_ylim(-0.8, len(selection) - 0.2)

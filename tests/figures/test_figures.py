@@ -203,6 +203,7 @@ def test_an_envelope_of_equal_values_has_an_axis():
     rows = [row | {"law": law, "quantity": "time connected"} for law in ("bernoulli", "per-link")]
     figure = envelope_figure(pd.DataFrame(rows).assign(inside=True, runs=20))
     assert np.ptp(figure.axes[0].get_xlim()) > 0.1
+    assert len(figure.axes[0].get_legend().get_texts()) == 3  # no replay is outside
 
 
 def test_results_draw_themselves(results, sweeps):
@@ -454,7 +455,9 @@ def test_only_what_happened_stands_in_titles_and_on_axes():
     assert "waits" not in run.plot("age").get_suptitle()
     assert run.plot("law").axes[0].get_xscale() == "log"
     ring = netkf.load(SCENARIOS / "gossip_ring.toml", {"horizon": 20.0})
-    assert netkf.simulate(ring).plot("losses").get_suptitle().endswith("messages were lost")
+    run = netkf.simulate(ring)
+    assert run.plot("losses").get_suptitle().endswith("messages were lost")
+    assert len(run.plot("links").axes[0].get_legend().get_texts()) == 1
 
 
 def test_nodes_of_a_matrix_that_have_labels_are_equally_far_apart():
