@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import importlib
 
-from netkf.core.errors import EngineError, NetkfError, ScenarioError, TheoryError
+from netkf.core.errors import EngineError as EngineError
+from netkf.core.errors import NetkfError as NetkfError
+from netkf.core.errors import ScenarioError as ScenarioError
+from netkf.core.errors import TheoryError as TheoryError
 from netkf.core.version import __version__ as __version__
 from netkf.core.wings import WINGS
 
@@ -15,35 +18,44 @@ of the time in which a command of netkf does not handle signals yet.
 if TYPE_CHECKING:
     from typing import Any
 
-    from netkf import parts, testing, theory
-    from netkf.checks.check import check
-    from netkf.ensembles.monte_carlo import Ensemble, monte_carlo
-    from netkf.figures.catalogue import plot
-    from netkf.logs.exporting import export_log, export_recorded
-    from netkf.logs.fitting import fit_log
-    from netkf.logs.importing import import_log
-    from netkf.neighbours.datasets import export_netcdf
-    from netkf.neighbours.graphml import export_graphml
-    from netkf.neighbours.models import from_control, from_filterpy
-    from netkf.neighbours.perfetto import export_perfetto
-    from netkf.report.embedded import page
-    from netkf.runs.readings import held_out_errors
-    from netkf.runs.run import save
-    from netkf.runs.simulate import simulate
-    from netkf.scenario.model import Belief, Filtering, Network
-    from netkf.scenario.reading import load
-    from netkf.scenario.scenario import Scenario
-    from netkf.scenario.stamps import Time
-    from netkf.studies.compare import compare
-    from netkf.studies.compare_filters import compare_filters
-    from netkf.studies.consistency import consistency
-    from netkf.studies.innovation_tests import innovations
-    from netkf.studies.likelihood import fit_noise, log_likelihood
+    from netkf import parts as parts
+    from netkf import testing as testing
+    from netkf import theory as theory
+    from netkf.checks.check import check as check
+    from netkf.ensembles.monte_carlo import Ensemble as Ensemble
+    from netkf.ensembles.monte_carlo import monte_carlo as monte_carlo
+    from netkf.figures.catalogue import plot as plot
+    from netkf.logs.exporting import export_log as export_log
+    from netkf.logs.exporting import export_recorded as export_recorded
+    from netkf.logs.fitting import fit_log as fit_log
+    from netkf.logs.importing import import_log as import_log
+    from netkf.neighbours.datasets import export_netcdf as export_netcdf
+    from netkf.neighbours.graphml import export_graphml as export_graphml
+    from netkf.neighbours.models import from_control as from_control
+    from netkf.neighbours.models import from_filterpy as from_filterpy
+    from netkf.neighbours.perfetto import export_perfetto as export_perfetto
+    from netkf.report.embedded import page as page
+    from netkf.runs.readings import held_out_errors as held_out_errors
+    from netkf.runs.run import save as save
+    from netkf.runs.simulate import simulate as simulate
+    from netkf.scenario.model import Belief as Belief
+    from netkf.scenario.model import Filtering as Filtering
+    from netkf.scenario.model import Network as Network
+    from netkf.scenario.reading import load as load
+    from netkf.scenario.scenario import Scenario as Scenario
+    from netkf.scenario.stamps import Time as Time
+    from netkf.studies.compare import compare as compare
+    from netkf.studies.compare_filters import compare_filters as compare_filters
+    from netkf.studies.consistency import consistency as consistency
+    from netkf.studies.innovation_tests import innovations as innovations
+    from netkf.studies.likelihood import fit_noise as fit_noise
+    from netkf.studies.likelihood import log_likelihood as log_likelihood
     from netkf.studies.opening import open as open
-    from netkf.studies.size import size
-    from netkf.studies.sweep import sweep
-    from netkf.studies.why import why
-    from netkf.trace.run import Run, first_difference
+    from netkf.studies.size import size as size
+    from netkf.studies.sweep import sweep as sweep
+    from netkf.studies.why import why as why
+    from netkf.trace.run import Run as Run
+    from netkf.trace.run import first_difference as first_difference
 
 _MODULE_OF = {
     "Belief": "netkf.scenario.model",
@@ -89,49 +101,9 @@ _MODULE_OF = {
 _MODULES = ("parts", "testing", "theory")
 """The public names that are modules themselves."""
 
-__all__ = [
-    "Belief",
-    "EngineError",
-    "Ensemble",
-    "Filtering",
-    "NetkfError",
-    "Network",
-    "Run",
-    "Scenario",
-    "ScenarioError",
-    "TheoryError",
-    "Time",
-    "check",
-    "compare",
-    "compare_filters",
-    "consistency",
-    "export_graphml",
-    "export_log",
-    "export_netcdf",
-    "export_perfetto",
-    "export_recorded",
-    "first_difference",
-    "fit_log",
-    "fit_noise",
-    "from_control",
-    "from_filterpy",
-    "held_out_errors",
-    "import_log",
-    "innovations",
-    "load",
-    "log_likelihood",
-    "monte_carlo",
-    "page",
-    "parts",
-    "plot",
-    "save",
-    "simulate",
-    "size",
-    "sweep",
-    "testing",
-    "theory",
-    "why",
-]
+_ERRORS = ("EngineError", "NetkfError", "ScenarioError", "TheoryError")
+# Without ``open``: ``from netkf import *`` must leave Python's own ``open`` alone.
+__all__ = [name for name in sorted([*_ERRORS, *_MODULE_OF]) if name != "open"]
 
 
 def _late(module: str, name: str) -> Any:
@@ -158,5 +130,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    # ``open`` is not in __all__: ``from netkf import *`` must leave Python's own ``open`` alone.
     return sorted([*__all__, "__version__", "open"])
