@@ -102,9 +102,7 @@ def _pairs_to_count(scenario: Scenario) -> tuple[IntArray, IntArray]:
     if len(sampled_indices(scenario)) == len(scenario.nodes):
         i, j = np.nonzero(~np.eye(len(scenario.nodes), dtype=bool))
         return i, j
-    index = scenario.topology.index
-    ends = [(index[a], index[b]) for a, b in scenario.topology.directions]
-    i, j = np.array(ends, dtype=np.int64).reshape(-1, 2).T
+    i, j = scenario.topology.direction_ends.T
     return i, j
 
 

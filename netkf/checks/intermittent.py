@@ -72,11 +72,10 @@ def _heard_directions(scenario: Scenario) -> list[Direction]:
 def _least_roots(scenario: Scenario) -> FloatArray:
     """Return for each sampled node the Cholesky root (n, n) of P*, nan without one."""
     # Without losses all slots are alike: one slot has the readings of each node.
-    arrivals, n = find_arrivals(scenario, None, slots=1), scenario.plant.n
-    F, Q = scenario.slot_belief
-    modes = arrivals.table.modes
-    roots = np.full((len(arrivals.sequences), n, n), np.nan)
-    for k, mode in enumerate(arrivals.sequences[:, 0].tolist()):
+    table, sequences = find_arrivals(scenario, None, slots=1)
+    (F, Q), n, modes = scenario.slot_belief, scenario.plant.n, table.modes
+    roots = np.full((len(sequences), n, n), np.nan)
+    for k, mode in enumerate(sequences[:, 0].tolist()):
         p = int(modes.rows[mode])
         try:
             # Whitened rows have noise of variance 1.
@@ -104,7 +103,7 @@ def _summarise(scenario: Scenario, run: Run) -> ReplicaSummary:
         summary.in_support = np.full(summary.P[-1].shape, np.nan)
         summary.spread = summary.averages = summary.in_support[:, 0, 0]
         return summary
-    table, sequences, _ = find_arrivals(scenario, run, slots[-1])
+    table, sequences = find_arrivals(scenario, run, slots[-1])
     # Roots of the covariances at the start, (W, n, n) each.
     starts = initial_roots(scenario)[sampled_indices(scenario)]
     steady_roots = _least_roots(scenario)
@@ -204,7 +203,7 @@ def _delivery_probability(scenario: Scenario, direction: Direction) -> float:
 
 def _above_least(samples: IntermittentSamples, level: float) -> Finding:
     slots = list(check_slots(samples.scenario))
-    table, sequences, _ = find_arrivals(samples.scenario, None, slots[-1])
+    table, sequences = find_arrivals(samples.scenario, None, slots[-1])
     starts = initial_roots(samples.scenario)[sampled_indices(samples.scenario)]
     without_loss = table.covariances(starts, sequences, slots)
     size = np.trace(samples.runs.P, axis1=-2, axis2=-1)

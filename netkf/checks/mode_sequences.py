@@ -267,17 +267,6 @@ def gossip_modes(scenario: Scenario) -> ModeTable:
     return ModeTable(F, square_root(Q), reading_modes(readings, len(F)))
 
 
-class Arrivals(NamedTuple):
-    """The readings that W sampled nodes used in each slot.
-
-    ``sequences`` (W, slots) are indices of modes; mode m is the readings of the nodes ``sets[m]``.
-    """
-
-    table: ModeTable
-    sequences: np.ndarray
-    sets: list[tuple[int, ...]]
-
-
 def sensing_neighbours(scenario: Scenario) -> dict[int, tuple[int, ...]]:
     """Return the nodes with sensors that each node may hear, in order."""
     sensing, topology = set(scenario.sensing_nodes), scenario.topology
@@ -298,8 +287,10 @@ def intermittent_modes(scenario: Scenario, sets: list[tuple[int, ...]]) -> ModeT
     return ModeTable(F, square_root(Q), reading_modes(readings, len(F)))
 
 
-def find_arrivals(scenario: Scenario, run: Run | None, slots: int) -> Arrivals:
-    """Return the readings that sampled nodes used in the first ``slots``; all without a run."""
+def find_arrivals(scenario: Scenario, run: Run | None, slots: int) -> tuple[ModeTable, np.ndarray]:
+    """Return the readings that W sampled nodes used in the first ``slots``, all without a run, as
+    indices (W, slots) of the modes of a table.
+    """
     arrived: dict[tuple[int, int], list[int]] = {}
     if run is not None:
         delivered = rows_of(run.log, "deliver")
@@ -317,4 +308,4 @@ def find_arrivals(scenario: Scenario, run: Run | None, slots: int) -> Arrivals:
             heard = neighbours[node] if run is None else arrived.get((node, t), ())
             nodes = tuple(sorted((*own_reading, *heard)))
             sequences[k, t] = modes.setdefault(nodes, len(modes))
-    return Arrivals(intermittent_modes(scenario, list(modes)), sequences, list(modes))
+    return intermittent_modes(scenario, list(modes)), sequences

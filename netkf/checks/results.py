@@ -9,8 +9,9 @@ import numpy as np
 
 from netkf.checks.parts.samples import PART_TYPES
 from netkf.checks.records.rows import Audit, audit_columns, read_audit
-from netkf.checks.samples import ReplicaSummary
+from netkf.checks.samples import ReplicaSummary, stack_summaries
 from netkf.ensembles.replicas import Form
+from netkf.laws import stack_runs
 
 
 class ReplicaResult(NamedTuple):
@@ -45,47 +46,37 @@ def result_columns(results: Sequence[ReplicaResult]) -> dict[str, np.ndarray]:
         "diverged": np.array([result.diverged for result in results]),
         **audit_columns([result.audit for result in results]),
     }
-    completed = [result for result in results if result.summary is not None]
-    if not completed:
-        return columns
-    for name in vars(completed[0].summary):
-        columns[f"summary.{name}"] = np.array(
-            [getattr(result.summary, name) for result in completed]
-        )
-    for part, first in (completed[0].parts or {}).items():
-        for name in first._fields:
-            values = [getattr((result.parts or {})[part], name) for result in completed]
-            columns[f"{part}.{name}"] = np.array(values)
+    summaries = [result.summary for result in results if result.summary is not None]
+    parts = [result.parts or {} for result in results if result.summary is not None]
+    if summaries:
+        fields = vars(stack_summaries(summaries))
+        columns |= {f"summary.{name}": values for name, values in fields.items()}
+        for part in parts[0]:
+            fields = stack_runs([one[part] for one in parts])._asdict()
+            columns |= {f"{part}.{name}": values for name, values in fields.items()}
     return columns
 
 
 def results_of_columns(columns: Mapping[str, Any]) -> list[ReplicaResult]:
     """Return the results of replicas, in order, of which these are the columns."""
-    columns = dict(columns)
-    audits = {name: columns.pop(name) for name in list(columns) if name.startswith("audit.")}
+    groups: dict[str, dict[str, Any]] = {}
+    for name, values in columns.items():
+        group, _, field = name.rpartition(".")
+        groups.setdefault(group, {})[field] = values
+    own, audits = groups.pop(""), groups.pop("audit", {})
     results, index = [], 0
-    for k, diverged in enumerate(columns["diverged"].tolist()):
-        difference, expected = float(columns["difference"][k]), bool(columns["expected"][k])
-        audit = read_audit(_select_fields({name: v[k] for name, v in audits.items()}, "audit"))
+    for k, diverged in enumerate(own["diverged"].tolist()):
+        difference, expected = float(own["difference"][k]), bool(own["expected"][k])
+        audit = read_audit({name: values[k] for name, values in audits.items()})
         if diverged:
             results.append(ReplicaResult(None, difference, expected, audit=audit))
             continue
-        values_of_replica = {name: v[index] for name, v in columns.items() if "." in name}
-        summary = ReplicaSummary(**_select_fields(values_of_replica, "summary"))
-        fields = {part: _select_fields(values_of_replica, part) for part in PART_TYPES}
-        parts = {part: PART_TYPES[part](**values) for part, values in fields.items() if values}
+        found = {g: {name: v[index] for name, v in of.items()} for g, of in groups.items()}
+        summary = ReplicaSummary(**found.pop("summary"))
+        parts = {part: PART_TYPES[part](**values) for part, values in found.items()}
         results.append(ReplicaResult(summary, difference, expected, parts, audit))
         index += 1
     return results
-
-
-def _select_fields(values: dict[str, Any], prefix: str) -> dict[str, Any]:
-    """Return the values named ``prefix.name``, by ``name``."""
-    return {
-        name.split(".", 1)[1]: value
-        for name, value in values.items()
-        if name.split(".", 1)[0] == prefix
-    }
 
 
 RESULTS_FORM = Form(result_columns, results_of_columns)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -67,65 +68,56 @@ class FigureSet:
     """Draws several figures of one result, whose data are computed only once."""
 
     def __init__(self, result: Any) -> None:
+        self._data: FigureData | None = None
+        self._caption: list[str] = []
         # A sweep is known by its attributes: its class is in a room above this one.
         is_sweep = hasattr(result, "keys") and hasattr(result, "table")
-        self._sweep: Any = result if is_sweep else None
-        self._envelope = getattr(result, "envelope", None)
-        # Compared filters have their curves.
-        curves = getattr(result, "curves", None)
-        if curves is not None:
-            self._origin = f"{result.scenario}: {result.runs:,} runs, seed {result.seed}."
-        if isinstance(result, (Mapping, Sequence)):
-            curves, self._origin = curves_of(result)
-        self._curves: Any = curves
-        is_table = is_sweep or self._envelope is not None or curves is not None
-        self._data = None if is_table else reduce_result(result)
+        envelope, curves = (getattr(result, name, None) for name in ("envelope", "curves"))
+        self._figures: dict[str, Callable[[], Picture]]
+        if envelope is not None:
+            self._figures = {FIT_FIGURES[0]: lambda: envelope_figure(envelope)}
+        elif curves is not None:  # of compared filters
+            origin = f"{result.scenario}: {result.runs:,} runs, seed {result.seed}."
+            self._figures = {"error": lambda: errors_figure(curves, origin)}
+        elif isinstance(result, (Mapping, Sequence)):
+            found = curves_of(result)
+            self._figures = {"error": lambda: errors_figure(*found)}
+        elif is_sweep:
+            sweep = result.scenario, result.table, result.keys, result.status
+            self._figures = {"stability": lambda: sweep_figure(*sweep)}
+            self._caption = [f"{result.scenario.name}, a sweep."]
+        else:
+            self._data = data = reduce_result(result)
+            self._figures = {name: partial(draw, data) for name, draw in FIGURES.items()}
 
     @property
     def names(self) -> tuple[str, ...]:
         """The names of the figures of this kind of result."""
-        if self._envelope is not None:
-            return FIT_FIGURES
-        if self._curves is not None:
-            return ("error",)
-        return ("stability",) if self._sweep is not None else tuple(FIGURES)
+        return tuple(self._figures)
 
     def draw(self, name: str, *, omit_slow: bool = False) -> Picture:
         """Return the figure, or one with the reason why it cannot be drawn or, with ``omit_slow``,
         is left out because it takes minutes. Raises ScenarioError for an unknown name.
         """
-        if name not in self.names:
+        if name not in self._figures:
             remedy = f"{suggest_nearest(name, self.names)}its figures are {', '.join(self.names)}"
             raise ScenarioError("figure", "is not known", name, remedy)
+        data = self._data
         with style_context():
             try:
-                if self._data is None:
-                    return self._draw_table()
-                if omit_slow and name == "stability":
-                    reason = reason_to_omit_stability(self._data)
+                if omit_slow and name == "stability" and data is not None:
+                    reason = reason_to_omit_stability(data)
                     if reason is not None:
                         raise UnavailableError(reason)
-                return FIGURES[name](self._data)
+                return self._figures[name]()
             except (UnavailableError, TheoryError) as error:
                 reason = str(error)
                 if isinstance(error, TheoryError):  # one figure without an answer stops no other
                     reason = f"Theory has no answer: {reason}."
                 headline = f"No {name.upper() if name in ACRONYMS else name} to show"
-                if self._envelope is not None:
-                    return message_figure(headline, reason, [])
-                if self._data is None:
-                    caption = [f"{self._sweep.scenario.name}, a sweep."]
-                    return message_figure(headline, reason, caption)
-                return message_figure(self._data.title(headline), reason, self._data.caption())
-
-    def _draw_table(self) -> Picture:
-        """Return the figure of curves, a fit or a sweep; raises UnavailableError."""
-        if self._curves is not None:
-            return errors_figure(self._curves, self._origin)
-        if self._envelope is not None:
-            return envelope_figure(self._envelope)
-        sweep = self._sweep
-        return sweep_figure(sweep.scenario, sweep.table, sweep.keys, sweep.status)
+                if data is None:
+                    return message_figure(headline, reason, self._caption)
+                return message_figure(data.title(headline), reason, data.caption())
 
 
 def plot_to_files(result: Any, names: tuple[str, ...], out: Path, file_format: str) -> list[Path]:

@@ -52,9 +52,8 @@ def _hops(topology: Topology) -> FloatArray:
     """Return the distances (N, N) in links; nodes without a path are beyond all others."""
     size = len(topology.nodes)
     links = np.eye(size, dtype=np.float32)
-    for i, j in topology.links:
-        a, b = topology.index[i], topology.index[j]
-        links[a, b] = links[b, a] = 1.0
+    a, b = topology.ends.T
+    links[a, b] = links[b, a] = 1.0
     distances, reached = np.zeros((size, size)), np.eye(size, dtype=bool)
     for _ in range(size):
         distances[~reached] += 1.0
@@ -94,10 +93,9 @@ def _lower_stress(X: FloatArray, distances: FloatArray) -> tuple[float, FloatArr
 
 def _pivot_layout(topology: Topology) -> Positions:
     """Return positions by Pivot MDS (Brandes and Pich, Graph Drawing 2006), for large networks."""
-    pairs = [(topology.index[i], topology.index[j]) for i, j in topology.links]
     # scipy 1.13 searches only graphs with 32-bit indices.
-    ends = np.array(pairs, dtype=np.int32)
-    size, (rows, columns) = len(topology.nodes), ends.reshape(-1, 2).T
+    ends = topology.ends.astype(np.int32)
+    size, (rows, columns) = len(topology.nodes), ends.T
     adjacency = scipy.sparse.csr_array((np.ones(len(ends)), (rows, columns)), shape=(size, size))
     pivots = np.linspace(0, size - 1, PIVOTS).astype(int)
     distances = scipy.sparse.csgraph.dijkstra(

@@ -292,16 +292,9 @@ def _draw_tail(axes: Any, sample: FloatArray, colour: str, dashes: str, label: s
 
 def _hears_one_sensor(scenario: Scenario) -> np.ndarray:
     """Return a mask (N,) of nodes without a sensor whose neighbours have one sensor in all."""
-    neighbours = {
-        node: [i for i, j in scenario.topology.directions if j == node] for node in scenario.nodes
-    }
-    return np.array(
-        [
-            node not in scenario.placed_sensors
-            and sum(len(scenario.placed_sensors.get(i, ())) for i in neighbours[node]) == 1
-            for node in scenario.nodes
-        ]
-    )
+    placed, senders = scenario.placed_sensors, scenario.topology.senders
+    heard = {node: sum(len(placed.get(i, ())) for i in senders(node)) for node in scenario.nodes}
+    return np.array([node not in placed and count == 1 for node, count in heard.items()])
 
 
 def _sample_invariant_law(data: FigureData) -> FloatArray | None:

@@ -450,8 +450,7 @@ def _fit_laws(
         ),
     ]
     if bursty:
-        chain = stats.fit_chain(outcomes)
-        laws.append(FittedLaw("gilbert-elliott", chain.values, chain.likelihood, cov=chain.cov))
+        laws.append(stats.fit_chain(outcomes))
         # Of each link heard packets that turn to lost ones, and the other way.
         turns = np.concatenate(np.split(outcomes.transitions, 2, axis=1))
         values = (turns[:, 1] + 0.5) / (turns[:, 0] + 1.0)

@@ -21,6 +21,7 @@ from scipy.stats import beta, chi2, kstwo, ncx2, norm
 
 from netkf.core.laws import WaitingLaw
 from netkf.linalg.arrays import FloatArray
+from netkf.logs.envelope import FittedLaw
 
 POWER = 0.9
 """The probability with which a departure of the size ``detectable`` is found."""
@@ -499,18 +500,8 @@ def residual_spread(outcomes: LogOutcomes, share: float, time: float) -> FloatAr
     return time * np.concatenate(parts)
 
 
-class FittedChain(NamedTuple):
-    """A Gilbert-Elliott chain that all links follow: ``values`` to_bad, to_good, deliver_good,
-    deliver_bad; ``cov`` (4, 4) of their logits; ``likelihood`` the logarithm.
-    """
-
-    values: FloatArray
-    cov: FloatArray
-    likelihood: float
-
-
-def fit_chain(outcomes: LogOutcomes) -> FittedChain:
-    """Return the chain of two states that makes the outcomes likeliest, links alike."""
+def fit_chain(outcomes: LogOutcomes) -> FittedLaw:
+    """Return the Gilbert-Elliott chain that makes the outcomes likeliest, links alike."""
     stretches = _pad_stretches(outcomes)
     count, heard = outcomes.counts.sum(axis=0)
     p = (heard + 0.5) / (count + 1.0)
@@ -532,7 +523,8 @@ def fit_chain(outcomes: LogOutcomes) -> FittedChain:
     values, x = expit(best.x), best.x
     if values[2] < values[3]:  # the states changed their names
         x = x[[1, 0, 3, 2]]
-    return FittedChain(expit(x), _inverse_curvature(x, stretches), -float(best.fun))
+    cov = _inverse_curvature(x, stretches)
+    return FittedLaw("gilbert-elliott", expit(x), -float(best.fun), cov=cov)
 
 
 def _pad_stretches(outcomes: LogOutcomes) -> np.ndarray:

@@ -109,30 +109,7 @@ def write_text(path: Path, text: str, writer: str = "") -> None:
 
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON file atomically; numbers that are not finite become null. Raises WriteError."""
-    write_text(path, json_text(value) + "\n")
-
-
-def json_text(value: Any, margin: str = "\n") -> str:
-    """Return ``json.dumps(to_json_value(value), indent=2)`` after a ``margin``, faster: each
-    dictionary or list of scalars takes one call of the compiled encoder.
-    """
-    if not isinstance(value, (dict, list, tuple)) or not value:
-        return json.dumps(to_json_value(value))
-    inner = margin + "  "
-    items = value.values() if isinstance(value, dict) else value
-    if not any(isinstance(item, (dict, list, tuple)) for item in items):
-        encoder = json.JSONEncoder(separators=("," + inner, ": "), allow_nan=False)
-        try:
-            text = encoder.encode(value)
-        except (TypeError, ValueError):  # numbers of numpy, or ones that are not finite
-            text = encoder.encode(to_json_value(value))
-        return text[0] + inner + text[1:-1] + margin + text[-1]
-    if isinstance(value, dict):
-        entries = (
-            f"{json.dumps(str(key))}: {json_text(item, inner)}" for key, item in value.items()
-        )
-        return "{" + inner + ("," + inner).join(entries) + margin + "}"
-    return "[" + inner + ("," + inner).join(json_text(item, inner) for item in value) + margin + "]"
+    write_text(path, json.dumps(to_json_value(value), indent=2) + "\n")
 
 
 def to_json_value(value: Any) -> Any:

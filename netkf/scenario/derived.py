@@ -473,10 +473,8 @@ class DerivedScenario(ScenarioModel):
         """The information (N, n, n) of each node's sensors, and indices of who hears whom."""
         if not self.node_filter.needs.network:
             return None
-        senders: dict[int, list[int]] = {node: [] for node in self.nodes}
-        for sender, receiver in self.topology.directions:
-            senders[receiver].append(self.topology.index[sender])
-        sender_indices = tuple(tuple(sorted(senders[node])) for node in self.nodes)
+        index, senders = self.topology.index, self.topology.senders
+        sender_indices = tuple(tuple(index[i] for i in senders(node)) for node in self.nodes)
         # Such filters estimate one state at all nodes.
         informations = np.stack([self.estimated_part(0, G) for G in self.informations])
         return NetworkInfo(informations, sender_indices)

@@ -707,7 +707,7 @@ class ScenarioModel(Component):
         table = 1.0 if delivery is None else delivery.get(link, 0.0)
         size = self.message_size(link[0], 0 if self.slotted else -1)
         frames = 1 if self.network.radio is None else self.network.radio.frames(size)
-        hearers = self._hearers[link[0]] if self.has_broadcasts else link[1:]
+        hearers = self.topology.receivers(link[0]) if self.has_broadcasts else link[1:]
         return Transmission(
             link, table_probability=table, distance=distance, hearers=hearers, size=size,
             frames=frames,
@@ -728,13 +728,6 @@ class ScenarioModel(Component):
             size = self.message_size(sender, phase)
             found.append((count / total, first._replace(size=size, frames=radio.frames(size))))
         return found or [(1.0, first)]
-
-    @cached_property
-    def _hearers(self) -> dict[int, tuple[int, ...]]:
-        found: dict[int, list[int]] = {}
-        for sender, receiver in self.topology.directions:
-            found.setdefault(sender, []).append(receiver)
-        return {sender: tuple(receivers) for sender, receivers in found.items()}
 
     def message_size(self, node: int, phase: int) -> float:
         """Return the bytes of a message of ``node`` (id) in a ``phase`` of a slot, or -1."""

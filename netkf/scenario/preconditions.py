@@ -273,8 +273,7 @@ def _check_invertible(scenario: DerivedScenario) -> None:
 
 def _check_ways(scenario: DerivedScenario) -> None:
     topology, N = scenario.topology, len(scenario.nodes)
-    pairs = np.array([[topology.index[end] for end in way] for way in topology.directions])
-    rows, columns = pairs.reshape(-1, 2).T
+    rows, columns = topology.direction_ends.T
     links = scipy.sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape=(N, N))
     # Strongly connected: node 0 reaches all, and all reach node 0.
     for one_way, text in (

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import tomllib
@@ -18,12 +17,6 @@ from netkf.scenario.tables import MAX_DEPTH, build_scenario, change_table, expla
 
 MAX_BYTES = 64 << 20  # of a scenario file
 MAX_DOTS = 100  # in a dotted key: tomllib takes minutes and gigabytes for very many
-# In texts of more characters than LONG_TEXT, lists of numbers on lines of more than LONG_LINE are
-# read by the json module instead of by tomllib.
-LONG_TEXT, LONG_LINE = 100_000, 1000
-_NUMBER_ARRAY = re.compile(r"([A-Za-z0-9_-]+)[ \t]*=[ \t]*(\[[0-9eE+\-., \t\[\]]*\])[ \t]*")
-"""A whole line ``key = [numbers, possibly nested]``; groups: key, array."""
-_TRAILING_COMMA, _LEADING_COMMA = re.compile(r",[ \t]*\]"), re.compile(r"\[[ \t]*,")
 _KEY_PART = r"""(?:[\w-]++|"[^"]*+"|'[^']*+')[ \t]*+"""
 _LONG_KEY = re.compile(rf"(?<![\w-])(?:{_KEY_PART}\.[ \t]*+){{{MAX_DOTS}}}")
 """MAX_DOTS parts of a dotted key, bare or quoted, with the dots after them."""
@@ -100,46 +93,14 @@ def parse_toml(text: str) -> dict[str, Any]:
     """Return the tables of a TOML text. Raises ScenarioError above MAX_DOTS and MAX_DEPTH,
     ValueError and RecursionError for other invalid texts.
     """
-    lines = text.splitlines()
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(text.splitlines(), 1):
         if line.count(".") > MAX_DOTS and _LONG_KEY.search(line):
             rule = f"line {number} has a key of more than {MAX_DOTS} parts"
             raise ScenarioError("", rule, None, "correct that line")
-    # The lines of a multi-line string must stay as they are, even if they look like arrays.
-    has_multiline_string = '"""' in text or "'''" in text
-    arrays: dict[str, Any] = {}
-    if len(text) > LONG_TEXT and not has_multiline_string:
-        prefix = os.urandom(16).hex()  # random, so that no text in the file begins with it
-        text = "\n".join(_extract_array(line, arrays, prefix) for line in lines)
-    tables: dict[str, Any] = _insert_arrays(tomllib.loads(text), arrays)
+    tables: dict[str, Any] = tomllib.loads(text)
     if _nesting_depth(tables) > MAX_DEPTH:
         raise ScenarioError("", "is nested too deep", None, "see the keys of a scenario file")
     return tables
-
-
-def _extract_array(line: str, arrays: dict[str, Any], prefix: str) -> str:
-    """Return a long line ``key = [numbers]`` as ``key = "placeholder"``, other lines unchanged."""
-    match = _NUMBER_ARRAY.fullmatch(line) if len(line) > LONG_LINE else None
-    # "[,]" is not valid TOML, but would be valid JSON once trailing commas are removed.
-    if match is None or _LEADING_COMMA.search(match[2]):
-        return line
-    try:
-        array = json.loads(_TRAILING_COMMA.sub("]", match[2]))
-    except (ValueError, RecursionError):
-        return line  # tomllib reads it, or explains what is wrong with it
-    placeholder = f"{prefix} {len(arrays)}"
-    arrays[placeholder] = array
-    return f'{match[1]} = "{placeholder}"'
-
-
-def _insert_arrays(value: Any, arrays: dict[str, Any]) -> Any:
-    if not arrays:
-        return value
-    if isinstance(value, dict):
-        return {key: _insert_arrays(entry, arrays) for key, entry in value.items()}
-    if isinstance(value, list):
-        return [_insert_arrays(entry, arrays) for entry in value]
-    return arrays.get(value, value) if isinstance(value, str) else value
 
 
 def _nesting_depth(value: Any) -> int:

@@ -157,13 +157,12 @@ def _stated_mean(watched: WatchedPart, topology: Topology) -> FloatArray | None:
     sums = mean.sum(axis=1)
     worst = float(sums[np.abs(sums - 1.0).argmax()])
     demand(abs(worst - 1.0) <= 1e-9, where, "rows must sum to 1", f"{worst:.6g}")
-    ends = np.array([[topology.index[node] for node in link] for link in topology.links])
-    without_links = mean.copy()
-    without_links[ends[:, 0], ends[:, 1]] = without_links[ends[:, 1], ends[:, 0]] = 0.0
+    (i, j), without_links = topology.ends.T, mean.copy()
+    without_links[i, j] = without_links[j, i] = 0.0
     np.fill_diagonal(without_links, 0.0)
     largest = float(without_links.max())
     demand(not without_links.any(), where, "must be 0 for pairs that are no link", largest)
-    return np.asarray(mean[ends[:, 0], ends[:, 1]])
+    return np.asarray(mean[i, j])
 
 
 def _check_frequencies(

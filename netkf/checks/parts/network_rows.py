@@ -197,8 +197,8 @@ def pair_probabilities(scenario: Scenario) -> FloatArray | None:
         mean = stated.mean(scenario.topology)
     except ScenarioError:
         return None
-    index = scenario.topology.index
-    return np.array([mean[index[i], index[j]] for i, j in scenario.topology.links])
+    i, j = scenario.topology.ends.T
+    return np.asarray(mean[i, j])
 
 
 def _check_matchings(samples: PartSamples, level: float) -> Finding:
