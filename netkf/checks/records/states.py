@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -128,12 +127,12 @@ def with_start(scenario: Scenario, horizon: float, log: np.ndarray | None = None
 def weight_fault(scenario: Scenario) -> str:
     """Return one line about the first link whose weight is not that of [filter]; or empty."""
     weights, index = getattr(scenario.filter.algorithm, "weights", None), scenario.topology.index
-    heard = Counter(receiver for _, receiver in scenario.topology.directions)
+    senders = scenario.topology.senders
     for sender, receiver in scenario.topology.directions:
         if isinstance(weights, np.ndarray):
             expected = float(weights[index[sender], index[receiver]])
         elif weights == METROPOLIS:
-            expected = 1.0 / (1.0 + max(heard[sender], heard[receiver]))
+            expected = 1.0 / (1.0 + max(len(senders(sender)), len(senders(receiver))))
         else:
             return ""
         seen = scenario.weight(receiver, sender)
