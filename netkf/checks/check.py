@@ -41,9 +41,9 @@ from netkf.checks.evidence import (
 )
 from netkf.checks.exact import promised_filter, with_base_filter, with_promised_filter
 from netkf.checks.paper import PaperChecks
+from netkf.checks.parts.events import stack_parts, summarise_parts
 from netkf.checks.parts.network_rows import loss_assumptions
 from netkf.checks.parts.rows import gaussian_noises, part_promises
-from netkf.checks.parts.samples import stack_parts, summarise_parts
 from netkf.checks.points import check_slots, probe_times
 from netkf.checks.records.rows import audit_record, audit_run, record_promises
 from netkf.checks.results import RESULTS_FORM, ReplicaResult

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.checks.parts.samples import PART_TYPES
+from netkf.checks.parts.events import PART_TYPES
 from netkf.checks.records.rows import Audit, audit_columns, read_audit
 from netkf.checks.samples import ReplicaSummary, stack_summaries
 from netkf.ensembles.replicas import Form

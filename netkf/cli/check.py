@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from netkf.runs.directory_lock import lock_directory
+    from netkf.runs.files import lock_directory
 
     # Promises are checked at other times than those of ``probe``, which therefore need not fit the
     # horizon; ``--set`` may have changed it.

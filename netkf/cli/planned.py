@@ -68,7 +68,7 @@ def run_plan(options: argparse.Namespace) -> int:
     """``netkf plan``: write the directory of an ensemble for workers, and a script of an array."""
     from netkf.ensembles.directory import EnsembleOptions
     from netkf.ensembles.plans import plan_ensemble
-    from netkf.runs.directory_lock import lock_directory
+    from netkf.runs.files import lock_directory
 
     with ProgressLine():
         scenario = load_scenario(options)
@@ -149,7 +149,7 @@ def _merge_ensemble(plan: Plan, options: argparse.Namespace) -> int:
     from netkf.cli.run import print_ensemble, print_summary
     from netkf.ensembles.plans import merge_plan
     from netkf.ensembles.replicas import Gap
-    from netkf.runs.directory_lock import lock_directory
+    from netkf.runs.files import lock_directory
 
     if plan.is_merged:
         print(f"nothing left to do in {plan.directory}")
@@ -173,7 +173,7 @@ def plan_study(run: Run, options: argparse.Namespace) -> int:
     from netkf.ensembles.parts import Worker
     from netkf.ensembles.planned_study import PlannedStudy
     from netkf.ensembles.plans import write_study
-    from netkf.runs.directory_lock import lock_directory
+    from netkf.runs.files import lock_directory
 
     for name in ("workers", "scheduler", "resume"):
         if getattr(options, name, None):
@@ -266,8 +266,7 @@ def _merge_again(options: argparse.Namespace, plan: Plan) -> int | None:
     """Add what results of an earlier merge lack; return the exit status, None if there are none."""
     from netkf.ensembles.parts import Worker
     from netkf.ensembles.planned_study import PlannedStudy
-    from netkf.runs.directory_lock import lock_directory
-    from netkf.runs.files import copy_file
+    from netkf.runs.files import copy_file, lock_directory
     from netkf.scenario.writing import resolve_defaults, to_toml
 
     numbered = Path("runs").glob("*-sweep-*") if plan.arguments[0] == "sweep" else ()

@@ -35,7 +35,7 @@ def _run(options: argparse.Namespace) -> int:
     if options.resume and options.out is None:
         remedy = "add --out DIR with the directory of the run that was stopped"
         raise ScenarioError("--resume", "needs the directory of the runs", None, remedy)
-    from netkf.runs.directory_lock import lock_directory
+    from netkf.runs.files import lock_directory
 
     with lock_directory(options.out):
         return _run_ensemble(scenario, options) if is_ensemble else _run_once(scenario, options)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 def run_sweep(options: argparse.Namespace) -> int:
     """``netkf sweep``: simulate every point of a grid of parameters."""
     from netkf.ensembles.pools import PoolOptions
-    from netkf.runs.directory_lock import lock_directory
+    from netkf.runs.files import lock_directory
     from netkf.studies.parameter_grid import parse_grid
     from netkf.studies.sweep import plan_sweep, sweep_to_directory
 
@@ -118,7 +118,7 @@ def run_size(options: argparse.Namespace) -> int:
 
 def run_compare_filters(options: argparse.Namespace) -> int:
     """``netkf compare-filters``: several filters on one truth and one network."""
-    from netkf.runs.directory_lock import lock_directory
+    from netkf.runs.files import lock_directory
 
     with lock_directory(options.out, must_be_empty=True):
         return _compare_filters(options)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from netkf.runs.directory_lock import lock_directory
+    from netkf.runs.files import lock_directory
 
     if (options.node is None) != (options.at is None):
         remedy = "give both, or neither for the worst sample"

@@ -14,8 +14,7 @@ from netkf.logs.packet_tables import read_tables
 from netkf.logs.packets import HOLE, PacketLog
 from netkf.logs.recorded_network import Files, write_network
 from netkf.logs.ulb import read_ulb
-from netkf.runs.directory_lock import lock_directory
-from netkf.runs.files import copy_file, write_text
+from netkf.runs.files import copy_file, lock_directory, write_text
 from netkf.scenario.reading import load
 
 DATA_SETS: Mapping[str, Callable[[Path], PacketLog]] = {"ulb": read_ulb, "mercator": read_mercator}

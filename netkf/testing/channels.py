@@ -13,12 +13,13 @@ import numpy as np
 import scipy.stats
 
 from netkf.laws import stack_runs
-from netkf.laws.delays import compare_delays, count_delays
 from netkf.laws.losses import (
     LossLaw,
     compare_bursts,
     compare_coincidences,
+    compare_delays,
     compare_losses,
+    count_delays,
     count_outcomes,
 )
 from netkf.laws.noise import compare_with

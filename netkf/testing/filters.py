@@ -3,18 +3,37 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+import warnings
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.filter import Filter, commutes
+from netkf.algorithms.filter import STEPS, Filter, commutes
+from netkf.algorithms.registry import base_filter, built_in_class, own_attributes
 from netkf.algorithms.traits import Needs, Timing, Weights
+from netkf.core.contracts import is_netkf_class
+from netkf.core.errors import ScenarioError
+from netkf.engines.base import Engine
+from netkf.engines.compiled.engine import CompiledEngine
+from netkf.engines.simpy.engine import SimpyEngine
 from netkf.linalg.arrays import FloatArray
-from netkf.testing.kernels import check_kernels
+from netkf.network.channels import Channel
+from netkf.network.lives import Crashes
+from netkf.network.losses import Bernoulli
+from netkf.scenario.scenario import Scenario
 from netkf.testing.observed import Seen
-from netkf.testing.parents import check_parent
-from netkf.testing.small_runs import run, setups
-from netkf.testing.watching import WatchedPart, checker, demand_kind, is_number, make_part
+from netkf.testing.small_runs import kinds_of, make_systems, run, setups, small_scenario
+from netkf.testing.watching import (
+    ROUNDING,
+    WatchedPart,
+    checker,
+    demand_kind,
+    fail,
+    is_number,
+    make_part,
+    scaled_difference,
+)
 
 MAX_DEGREE = 8  # weights are checked for all pairs of degrees up to it
 SHIFT_TOLERANCE = 1e-9  # relative to the estimates before the shift is subtracted
@@ -148,3 +167,149 @@ def _check_matrix(watched: WatchedPart, weights: FloatArray) -> None:
     rule = "columns, the weights that a node gives, must sum to at most 1"
     remedy = "entry [l, i] is the weight node i gives to what node l sends"
     demand(where, (sums <= 1.0 + 1e-9).all(), rule, sums, remedy)
+
+
+RUNS = range(9)
+"""Runs that compare kernels: more than are side by side."""
+DELIVERY, UP, DOWN = 0.6, 3.0, 1.0
+"""Delivery probability, and mean times in ticks for which node 0 is up and down."""
+
+
+def check_kernels(watched: WatchedPart) -> None:
+    """Check that a user's kernels give the same numbers in both engines, and beside other runs."""
+    part, compiled = watched.part, CompiledEngine()
+    if part.kernels is None or is_netkf_class(type(part)):
+        return
+    for scenario in _kernel_scenarios(part):
+        if compiled.refusal(scenario) is not None:
+            continue
+        alone, beside = (_simulate(engine, scenario) for engine in (SimpyEngine(), compiled))
+        for name, one, other in zip(("xhat", "P"), alone, beside, strict=True):
+            differences = [scaled_difference(*pair) for pair in zip(one, other, strict=True)]
+            run = int(np.argmax(differences))
+            rule = "must give each run what it has alone, in both engines"
+            got = f"{name} that differs by {differences[run]:.2g} of its size in run {run}"
+            remedy = "compute in all lanes: select by run.arrived, and leave messages as they are"
+            watched.demand("kernels", differences[run] <= ROUNDING, rule, got, remedy)
+
+
+def _kernel_scenarios(part: Any) -> Iterator[Scenario]:
+    """Yield a scenario in slots, and one under clocks, that the filter accepts."""
+    kinds, channel = kinds_of(part), Channel(loss=Bernoulli(DELIVERY))
+    for slotted in (True, False):
+        system = make_systems(part.needs.inverts or part.needs.inverts_under_clocks)[-1]
+        kind = next((k for k in kinds if bool(k.slots) == slotted and not k.increments), None)
+        if kind is None:
+            continue
+        kind = kind._replace(slots=4 * kind.slots)
+        crashes = Crashes(nodes=(0,), mean_up=UP, mean_down=DOWN)
+        try:
+            yield small_scenario(part, system, kind, channel, (crashes,))
+        except ScenarioError:  # it cannot be down
+            yield small_scenario(part, system, kind, channel)
+
+
+def _simulate(engine: Engine, scenario: Scenario) -> tuple[FloatArray, FloatArray]:
+    """Return xhat (R, T, F, n) and P (R, T, F, n, n) of all runs, without nan."""
+    batches = list(engine.run_many(scenario, 0, RUNS))
+    xhat, P = (np.concatenate([getattr(b, name) for b in batches]) for name in ("xhat", "P"))
+    return np.nan_to_num(xhat), np.nan_to_num(P)
+
+
+PARENT_TOLERANCE = 1e-6
+"""Largest relative difference that another order of operations may cause."""
+UNEQUAL = np.array([[0.5, 0.3, 0.2], [0.2, 0.5, 0.3], [0.3, 0.2, 0.5]])
+"""Weights of three nodes whose rows and columns sum to 1, and are not the same."""
+
+
+class EstimateDifference(NamedTuple):
+    """A difference of estimates from those of the parent.
+
+    relative : difference divided by the size of the quantity
+    quantity : "xhat" or "P"
+    where    : node and time, as text
+    """
+
+    relative: float
+    quantity: str
+    where: str
+
+
+def check_parent(watched: WatchedPart, same_as_parent: bool | None) -> None:
+    """Compare a filter that overrides something with its built-in parent, in slots and under
+    clocks.
+
+    Raises AssertionError if estimates differ by more than PARENT_TOLERANCE; with ``same_as_parent``
+    None, a class that defines one of the methods STEPS gets a UserWarning instead.
+    """
+    part = watched.part
+    parent_class = built_in_class(part)
+    overrides = own_attributes(part)
+    if same_as_parent is False or parent_class is None or not overrides:
+        return
+    child, parent = watched.unchecked(), WatchedPart(base_filter(part)).unchecked()
+    worst = largest_difference(child, parent)
+    # Weights that are equal, or of the same matrix by rows and columns, say nothing of the order.
+    if isinstance(getattr(parent.part, "weights", None), str):
+        child, parent = (_with_weights(one, UNEQUAL) for one in (child, parent))
+        worst = max(filter(None, (worst, largest_difference(child, parent))), default=None)
+    if worst is None or worst.relative <= PARENT_TOLERANCE:
+        return
+    _forbid_transposed(watched.name, child, parent)
+    size = f"{worst.quantity} differs by {worst.relative:.3g} of its size {worst.where}"
+    rule = f"must have the numbers of {parent_class.__name__}, which it derives from"
+    remedy = "say same_as_parent=False if it differs by design"
+    text = f"{size}; its own: {', '.join(overrides)}"
+    if same_as_parent is None and set(overrides) & set(STEPS):
+        message = f"{watched.name}: {rule}, or say so; {text}; {remedy}"
+        warnings.warn(message, UserWarning, stacklevel=4)
+        return
+    fail(f"{watched.name}.{overrides[0]}", rule, text, remedy)
+
+
+def _with_weights(watched: WatchedPart, weights: FloatArray) -> WatchedPart:
+    changed = dataclasses.replace(watched.part, weights=weights)
+    return WatchedPart(changed).unchecked()
+
+
+def _forbid_transposed(name: str, child: WatchedPart, parent: WatchedPart) -> None:
+    weights = getattr(parent.part, "weights", None)
+    if not isinstance(weights, np.ndarray) or np.array_equal(weights, weights.T):
+        return
+    try:
+        difference = largest_difference(child, _with_weights(parent, weights.T))
+    except ScenarioError:  # columns that do not sum to 1 are no weights
+        return
+    if difference is not None and difference.relative <= PARENT_TOLERANCE:
+        rule = "must give node i's weight for node l in entry [l, i]"
+        remedy = "exchange rows and columns"
+        fail(f"{name}.weights", rule, "the weights that node l gives to node i", remedy)
+
+
+def largest_difference(child: WatchedPart, parent: WatchedPart) -> EstimateDifference | None:
+    """Return the largest relative difference of two filters' estimates, or None."""
+    found: list[EstimateDifference] = []
+    # Where all nodes hear the same, weights of estimates show only if these differ at first.
+    spread = 1.0 if isinstance(getattr(child.part, "weights", None), np.ndarray) else 0.0
+    for system, kind in setups(child.part, parent.part):
+        _, own = run(child, system, kind, spread=spread)
+        try:
+            _, other = run(parent, system, kind, spread=spread)
+        except AssertionError:
+            continue  # the parent requires more than the child, such as regular covariances
+        if own.xhat.shape == other.xhat.shape:
+            unit = "slot" if kind.slots else "round"
+            found.append(_difference("xhat", own.xhat, other.xhat, unit))
+            found.append(_difference("P", own.P, other.P, unit))
+    return max(found, key=lambda one: one.relative, default=None)
+
+
+def _difference(quantity: str, one: FloatArray, other: FloatArray, unit: str) -> EstimateDifference:
+    """Return the largest difference of estimates (T, N, ...), 0 where they are nan."""
+    rest = tuple(range(2, one.ndim))
+    size = 1.0 + np.abs(one).max(axis=rest) + (np.abs(other).max(axis=rest) if one.ndim < 4 else 0)
+    relative = np.nan_to_num(np.abs(one - other).max(axis=rest) / size)
+    k, node = np.unravel_index(int(np.argmax(relative)), relative.shape)
+    return EstimateDifference(
+        float(relative[k, node]), quantity, f"at node {node} after {unit} {k}"
+    )

@@ -15,8 +15,13 @@ from netkf.checks.parts.noises import reading_labels, reading_noises, sensor_law
 from netkf.checks.records import rows
 from netkf.checks.records.events import event_fault
 from netkf.checks.records.files import files_fault
-from netkf.checks.records.states import sample_fault, start_fault, weight_fault, with_start
-from netkf.checks.records.twin import twin_fault
+from netkf.checks.records.states import (
+    sample_fault,
+    start_fault,
+    twin_fault,
+    weight_fault,
+    with_start,
+)
 from netkf.checks.storage import load_verdict, save_verdict
 from netkf.core.errors import ScenarioError
 from netkf.engines.base import Rank

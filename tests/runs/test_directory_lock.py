@@ -12,13 +12,13 @@ import pytest
 import netkf
 from netkf.cli.main import main
 from netkf.logs.importing import write_folder
-from netkf.runs.directory_lock import lock_directory
+from netkf.runs.files import lock_directory
 
 RING = str(Path(__file__).parents[2] / "scenarios" / "poisson_ring.toml")
 HOLD = """
 import sys, time
 from pathlib import Path
-from netkf.runs.directory_lock import lock_directory
+from netkf.runs.files import lock_directory
 with lock_directory(Path(sys.argv[1])):
     print("locked", flush=True)
     time.sleep(60)

@@ -12,7 +12,7 @@ from netkf.algorithms.push_sum import SLOTS
 from netkf.algorithms.registry import own_attributes
 from netkf.kernels import kernel
 from netkf.testing import check_filter
-from netkf.testing.parents import check_parent
+from netkf.testing.filters import check_parent
 from netkf.testing.watching import WatchedPart
 
 ADJUSTED, DEFINED, SAME = {}, {}, {}

@@ -1,18 +1,29 @@
-"""Counts of the ticks, messages and pairs in the events of one run, and the laws stated of them."""
+"""Counts of the ticks, messages and pairs of runs, and the laws that are stated of them; all
+statistics of the parts of a scenario, stacked over runs.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 
+from netkf.checks.parts.noises import plant_noises, reading_noises
 from netkf.core.clock import Entity, generate_ticks
 from netkf.core.laws import EXPONENTIAL
-from netkf.laws.delays import DelayCounts, count_delays, count_fixed
-from netkf.laws.losses import LossCounts, LossLaw, PairCounts
+from netkf.laws import stack_runs
+from netkf.laws.losses import (
+    DelayCounts,
+    LossCounts,
+    LossLaw,
+    PairCounts,
+    count_delays,
+    count_fixed,
+)
+from netkf.laws.noise import NoiseDraws
 from netkf.laws.stating import stated_law, stated_part
 from netkf.laws.ticks import ClockGroup, TickCounts, count_by_window, count_ticks
 from netkf.linalg.arrays import FloatArray, IntArray
@@ -23,7 +34,7 @@ from netkf.network.matchings import Matching
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.random_links import has_constant_losses
-from netkf.trace.messages import LOST
+from netkf.trace.messages import LOST, join_messages
 from netkf.trace.run import Run
 from netkf.trace.schema import rows_of
 
@@ -301,3 +312,60 @@ def delay_counts(scenario: Scenario, messages: np.ndarray) -> DelayCounts | None
     ages = np.nan_to_num(messages["age"][followed], nan=np.inf)
     sent, direction, size = messages["sent"][followed], direction[followed], len(losses.links)
     return count_delays(law, sent, ages, direction, size, scenario.horizon)
+
+
+PART_TYPES: dict[str, type[Any]] = {
+    "ticks": TickCounts,
+    "fates": LossCounts,
+    "pairs": PairCounts,
+    "steps": NoiseDraws,
+    "readings": NoiseDraws,
+    "delays": DelayCounts,
+    "sampling": TickCounts,
+}
+"""The statistics of a run: ticks and samples of the clocks of the network and of sensors, losses
+and delays of messages, matchings of slots, and noises of the plant and of the readings.
+"""
+
+
+def summarise_parts(scenario: Scenario, run: Run) -> dict[str, Any]:
+    """Return counts and draws of a run by the names of PART_TYPES, to compare parts with their
+    laws; without those of parts that the scenario has not. Noises are drawn again.
+    """
+    streams, messages = Streams(run.seed, run.replica), join_messages(run.log)
+    found = {
+        "ticks": tick_counts(scenario, run),
+        "fates": loss_counts(scenario, messages),
+        "pairs": pair_counts(scenario, run),
+        "steps": plant_noises(scenario, streams),
+        "readings": reading_noises(scenario, streams),
+        "delays": delay_counts(scenario, messages),
+        "sampling": sample_counts(scenario, run),
+    }
+    return {name: part for name, part in found.items() if part is not None}
+
+
+@dataclasses.dataclass(frozen=True)
+class PartSamples:
+    """The summaries of R runs of one seed, which all tests of parts get, by the names of
+    PART_TYPES, None without such a part; the arrays in them have a first axis of length R.
+    """
+
+    scenario: Scenario
+    seed: int
+    ticks: Any = None
+    fates: Any = None
+    pairs: Any = None
+    steps: Any = None
+    readings: Any = None
+    delays: Any = None
+    sampling: Any = None
+
+
+def stack_parts(
+    scenario: Scenario, seed: int, summaries: Sequence[Mapping[str, Any]]
+) -> PartSamples:
+    """Return the ``summaries`` of R runs of ``seed`` as one object for the tests."""
+    present = {name: [one[name] for one in summaries if name in one] for name in PART_TYPES}
+    columns = {name: stack_runs(counts) for name, counts in present.items() if counts}
+    return PartSamples(scenario, seed, **columns)

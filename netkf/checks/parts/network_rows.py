@@ -13,11 +13,10 @@ from netkf.checks import evidence
 from netkf.checks.evidence import Assumption, Finding, Promise, find_identity
 from netkf.checks.laws import find
 from netkf.checks.parts import events
-from netkf.checks.parts.events import loss_law, stated_delay
-from netkf.checks.parts.samples import PartSamples
+from netkf.checks.parts.events import PartSamples, loss_law, stated_delay
 from netkf.core.clock import Entity
 from netkf.core.errors import ScenarioError
-from netkf.laws import delays, losses, ticks
+from netkf.laws import losses, ticks
 from netkf.laws.intervals import LawComparison, with_drawn
 from netkf.laws.stating import stated_part
 from netkf.laws.ticks import ClockGroup
@@ -214,7 +213,7 @@ def _check_fixed(samples: PartSamples, level: float) -> Finding:
 
 def _check_delays(samples: PartSamples, level: float) -> Finding:
     links = samples.scenario.topology.directions
-    law, means = delays.compare_delays(samples.delays, links, level)
+    law, means = losses.compare_delays(samples.delays, links, level)
     finding = find(law, SHARE_TOLERANCE)
     # The law of all delays is reported if it is wrong, or if no direction is significantly off.
     if finding.margin[2] < 0.0 or means.worst is None:

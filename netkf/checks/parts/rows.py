@@ -10,9 +10,9 @@ import scipy
 
 from netkf.checks.evidence import GAUSSIAN, PLANT, SENSORS, START, Assumption, Finding, Promise
 from netkf.checks.laws import find
+from netkf.checks.parts.events import PartSamples
 from netkf.checks.parts.network_rows import network_promises
 from netkf.checks.parts.noises import path_law, reading_labels, start_states, whitened_starts
-from netkf.checks.parts.samples import PartSamples
 from netkf.laws.noise import (
     NoiseDraws,
     compare_cells,

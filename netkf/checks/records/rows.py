@@ -20,8 +20,7 @@ from netkf.checks.evidence import (
 )
 from netkf.checks.records.events import event_fault
 from netkf.checks.records.files import FilesUnknownError, files_fault
-from netkf.checks.records.states import sample_fault, start_fault, with_start
-from netkf.checks.records.twin import twin_fault
+from netkf.checks.records.states import sample_fault, start_fault, twin_fault, with_start
 from netkf.engines.base import Engine
 from netkf.engines.simpy.engine import SimpyEngine
 from netkf.runs.simulate import simulate

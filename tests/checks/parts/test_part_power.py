@@ -8,14 +8,13 @@ import math
 import numpy as np
 import pytest
 
-from netkf.checks.parts.events import loss_law
+from netkf.checks.parts.events import PartSamples, loss_law
 from netkf.checks.parts.network_rows import (
     BURSTS,
     LOSSES_APART,
     MATCHING_ROW,
     pair_probabilities,
 )
-from netkf.checks.parts.samples import PartSamples
 from netkf.laws.intervals import correlation_interval, deviation_interval, probability_interval
 from netkf.laws.losses import PairCounts, count_outcomes, mean_correlation
 from netkf.laws.noise import _between, _in_size, _in_time

@@ -12,10 +12,9 @@ import scipy.stats
 import netkf
 from netkf.checks.evidence import BROKEN, HOLDS, judge
 from netkf.checks.laws import find
-from netkf.checks.parts.events import _entity_indices
+from netkf.checks.parts.events import _entity_indices, stack_parts, summarise_parts
 from netkf.checks.parts.noises import path_law, plant_noises, start_states, whitened_starts
 from netkf.checks.parts.rows import part_promises
-from netkf.checks.parts.samples import stack_parts, summarise_parts
 from netkf.laws.intervals import probability_interval, scale_interval
 from netkf.laws.losses import correlation_of_runs, neighbours_variance
 from netkf.laws.noise import (
