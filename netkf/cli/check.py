@@ -6,27 +6,25 @@ import argparse
 import contextlib
 import shlex
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
+from netkf.checks.check import MAX_LOOKED_RUNS, USUAL_RUNS, Verdict, check, usual_runs
+from netkf.checks.points import sampling_note
+from netkf.checks.report import verdict_json, verdict_text
+from netkf.checks.storage import PICTURE, clear_unfinished, load_verdict, save_verdict
 from netkf.cli import pictures
 from netkf.cli.options import FAILED, load_scenario, pool_settings, print_json, print_notes
 from netkf.cli.progress import ProgressLine
 from netkf.core.errors import ScenarioError
-
-if TYPE_CHECKING:
-    from netkf.checks.check import Verdict
-    from netkf.scenario.scenario import Scenario
+from netkf.runs.files import create_output_directory, lock_directory
+from netkf.scenario.scenario import Scenario
+from netkf.scenario.usage import unused_notes
 
 
 def _run(options: argparse.Namespace) -> int:
-    from netkf.runs.files import lock_directory
-
     # Promises are checked at other times than those of ``probe``, which therefore need not fit the
     # horizon; ``--set`` may have changed it.
     scenario = load_scenario(options, {"probe": [0.0]})
     if options.runs is None:
-        from netkf.checks.check import USUAL_RUNS, usual_runs
-
         options.runs = usual_runs(scenario)
         if options.runs < USUAL_RUNS:
             print_notes([f"{options.runs} runs, of {len(scenario.nodes):,} nodes; see --runs"])
@@ -35,10 +33,6 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _check(scenario: Scenario, options: argparse.Namespace) -> int:
-    from netkf.checks.points import sampling_note
-    from netkf.checks.report import verdict_json, verdict_text
-    from netkf.scenario.usage import unused_notes
-
     # The verdict in --out to which --resume adds runs.
     earlier = _open_verdict_directory(scenario, options)
     # The same command may have been given before, and stopped after it wrote its verdict.
@@ -69,8 +63,6 @@ def _check(scenario: Scenario, options: argparse.Namespace) -> int:
 
 
 def _run_check(scenario: Scenario, options: argparse.Namespace, earlier: Verdict | None) -> Verdict:
-    from netkf.checks.check import MAX_LOOKED_RUNS, check
-
     with _explain_interrupt(options, earlier), ProgressLine() as line:
         settings = {**pool_settings(options), "progress": line.make_count_update("runs")}
         settings |= {name: getattr(options, name) for name in ("confidence", "until")}
@@ -99,9 +91,6 @@ def _open_verdict_directory(scenario: Scenario, options: argparse.Namespace) -> 
             remedy = "add --out DIR with the directory of the verdict"
             raise ScenarioError("--resume", "needs a verdict to add runs to", None, remedy)
         return None
-    from netkf.checks.storage import clear_unfinished, load_verdict
-    from netkf.runs.files import create_output_directory
-
     if options.resume and not clear_unfinished(options.out, scenario):
         return load_verdict(options.out, scenario, scenario.seed)
     create_output_directory(options.out, scenario.name)
@@ -112,8 +101,6 @@ def _write_verdict(
     scenario: Scenario, verdict: Verdict, text: str, options: argparse.Namespace
 ) -> None:
     """Write ``text`` (unless empty) and the other files of a verdict, and its missing picture."""
-    from netkf.checks.storage import PICTURE, save_verdict
-
     if text:
         save_verdict(options.out, scenario, verdict, text)
     picture = options.out / PICTURE

@@ -7,6 +7,13 @@ import contextlib
 import shlex
 from typing import Any
 
+from netkf import export_graphml, export_netcdf, export_perfetto
+from netkf.core.errors import ScenarioError
+from netkf.ensembles.monte_carlo import Ensemble
+from netkf.logs.exporting import export_log, export_recorded
+from netkf.studies.opening import open as open_directory
+from netkf.trace.run import Run
+
 NEXT = {
     "netcdf": "xarray.load_dataset({0!r}) in Python",
     "graphml": "networkx.read_graphml({0!r}) in Python",
@@ -16,11 +23,6 @@ NEXT = {
 
 
 def _run(options: argparse.Namespace) -> int:
-    from netkf.core.errors import ScenarioError
-    from netkf.ensembles.monte_carlo import Ensemble
-    from netkf.studies.opening import open as open_directory
-    from netkf.trace.run import Run
-
     is_folder = options.to not in NEXT
     window = _window(options.window, options.to)
     if is_folder and options.out is None:
@@ -32,8 +34,6 @@ def _run(options: argparse.Namespace) -> int:
     run: Any = stored
     if is_folder:
         return _write_folder(run, options)
-    from netkf import export_graphml, export_netcdf, export_perfetto
-
     out = options.directory if options.out is None else options.out
     if options.to == "perfetto":
         (path,) = export_perfetto(run, out, *window)
@@ -45,8 +45,6 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _write_folder(run: Any, options: argparse.Namespace) -> int:
-    from netkf.logs.exporting import export_log, export_recorded
-
     recorded = options.to == "recorded"
     *files, last = (export_recorded if recorded else export_log)(run, options.out)
     print(f"written: {last} with {', '.join(path.name for path in files)}")
@@ -60,8 +58,6 @@ def _write_folder(run: Any, options: argparse.Namespace) -> int:
 
 def _window(text: str | None, form: str) -> tuple[float, ...]:
     """Return begin and end in seconds of "FROM:TO", of which either may be left out."""
-    from netkf.core.errors import ScenarioError
-
     if text is None:
         return ()
     if form != "perfetto":

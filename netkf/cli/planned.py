@@ -18,21 +18,32 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
 from netkf.cli import pictures
 from netkf.cli.options import FAILED, MARGIN, load_scenario, print_notes
 from netkf.cli.progress import ProgressLine
+from netkf.cli.run import print_ensemble, print_summary
 from netkf.core.errors import ScenarioError
 from netkf.core.printable import count_phrase
-
-if TYPE_CHECKING:
-    from netkf.ensembles.parts import Part
-    from netkf.ensembles.planned_study import PlannedStudy
-    from netkf.ensembles.plans import Plan
-    from netkf.ensembles.pools import PoolOptions
-    from netkf.ensembles.replicas import Gap
-    from netkf.scenario.scenario import Scenario
+from netkf.ensembles.directory import EnsembleOptions
+from netkf.ensembles.parts import Part, Worker, part_of_array
+from netkf.ensembles.planned_study import PlannedStudy
+from netkf.ensembles.plans import (
+    Plan,
+    merge_plan,
+    open_plan,
+    plan_ensemble,
+    require_equal_installations,
+    work_on_plan,
+    write_study,
+)
+from netkf.ensembles.pools import PoolOptions, make_pool
+from netkf.ensembles.replicas import Gap, MissingRunsError, missing_ranges
+from netkf.runs.documents import FINAL_STATUSES, DamagedError, read_document
+from netkf.runs.failures import InterruptedRunError
+from netkf.runs.files import copy_file, lock_directory
+from netkf.scenario.scenario import Scenario
+from netkf.scenario.writing import resolve_defaults, to_toml
 
 Run = Callable[[argparse.Namespace], int]
 SHOWN = 20  # ranges of missing runs that are listed
@@ -66,10 +77,6 @@ TASKS = 64
 
 def run_plan(options: argparse.Namespace) -> int:
     """``netkf plan``: write the directory of an ensemble for workers, and a script of an array."""
-    from netkf.ensembles.directory import EnsembleOptions
-    from netkf.ensembles.plans import plan_ensemble
-    from netkf.runs.files import lock_directory
-
     with ProgressLine():
         scenario = load_scenario(options)
         tasks = min(options.tasks or TASKS, options.runs)
@@ -113,10 +120,6 @@ def _array(directory: Path, name: str, tasks: int, options: argparse.Namespace) 
 
 def run_work(options: argparse.Namespace) -> int:
     """``netkf work``: simulate a part of a plan."""
-    from netkf.ensembles.parts import Part, part_of_array
-    from netkf.ensembles.plans import open_plan, work_on_plan
-    from netkf.ensembles.pools import PoolOptions
-
     plan = open_plan(options.directory, options.trust)
     part = Part(*options.part) if options.part else part_of_array(plan.tasks)
     workers = None if options.scheduler else options.workers or 1
@@ -138,19 +141,12 @@ def run_work(options: argparse.Namespace) -> int:
 
 def run_merge(options: argparse.Namespace) -> int:
     """``netkf merge``: turn the results of all workers of a plan into one ensemble or study."""
-    from netkf.ensembles.plans import open_plan
-
     with ProgressLine():
         plan = open_plan(options.directory, options.trust)
         return (merge_study if plan.arguments else _merge_ensemble)(plan, options)
 
 
 def _merge_ensemble(plan: Plan, options: argparse.Namespace) -> int:
-    from netkf.cli.run import print_ensemble, print_summary
-    from netkf.ensembles.plans import merge_plan
-    from netkf.ensembles.replicas import Gap
-    from netkf.runs.files import lock_directory
-
     if plan.is_merged:
         print(f"nothing left to do in {plan.directory}")
         return 0
@@ -170,11 +166,6 @@ def _merge_ensemble(plan: Plan, options: argparse.Namespace) -> int:
 
 def plan_study(run: Run, options: argparse.Namespace) -> int:
     """Write the plan of the study that ``run`` does with these options; return the exit status."""
-    from netkf.ensembles.parts import Worker
-    from netkf.ensembles.planned_study import PlannedStudy
-    from netkf.ensembles.plans import write_study
-    from netkf.runs.files import lock_directory
-
     for name in ("workers", "scheduler", "resume"):
         if getattr(options, name, None):
             remedy = "leave it out; netkf work has --workers"
@@ -209,10 +200,6 @@ def work_on_study(plan: Plan, part: Part, pool: PoolOptions, options: argparse.N
     """Simulate a part of the runs of each ensemble; return the exit status, 1 if some are left.
     With rounds other jobs are waited for as long as ``--for`` allows.
     """
-    from netkf.ensembles.parts import Worker
-    from netkf.ensembles.planned_study import PlannedStudy
-    from netkf.runs.failures import InterruptedRunError
-
     study_options = _study_options(plan, options)
     rounds, study_options.works = has_rounds(study_options), True
     with ProgressLine() as line:
@@ -241,10 +228,6 @@ def work_on_study(plan: Plan, part: Part, pool: PoolOptions, options: argparse.N
 
 def merge_study(plan: Plan, options: argparse.Namespace) -> int:
     """Finish the study as its command would; return its exit status, 1 if runs are missing."""
-    from netkf.ensembles.parts import Worker
-    from netkf.ensembles.planned_study import PlannedStudy
-    from netkf.ensembles.plans import require_equal_installations
-
     study_options = _study_options(plan, options)
     rounds = has_rounds(study_options)
     study = PlannedStudy(plan.directory, Worker(None), returns=rounds)
@@ -264,11 +247,6 @@ def merge_study(plan: Plan, options: argparse.Namespace) -> int:
 
 def _merge_again(options: argparse.Namespace, plan: Plan) -> int | None:
     """Add what results of an earlier merge lack; return the exit status, None if there are none."""
-    from netkf.ensembles.parts import Worker
-    from netkf.ensembles.planned_study import PlannedStudy
-    from netkf.runs.files import copy_file, lock_directory
-    from netkf.scenario.writing import resolve_defaults, to_toml
-
     numbered = Path("runs").glob("*-sweep-*") if plan.arguments[0] == "sweep" else ()
     out, same = getattr(options, "out", None), to_toml(resolve_defaults(plan.scenario)).encode()
     files = [folder / "scenario.toml" for folder in ([out] if out else sorted(numbered))]
@@ -296,8 +274,6 @@ def _merge_again(options: argparse.Namespace, plan: Plan) -> int | None:
 
 def _left_out(folder: Path, new: Path) -> list[str] | None:
     """Return the files that a ``folder`` of the results ``new`` lacks; None if it has others."""
-    from netkf.runs.documents import FINAL_STATUSES, DamagedError, read_document
-
     names = [str(file.relative_to(new)) for file in new.rglob("*") if file.is_file()]
     same, other, missing = filecmp.cmpfiles(new, folder, names, shallow=False)
     with contextlib.suppress(DamagedError):
@@ -325,8 +301,6 @@ def _missing_runs(
     run: Run, options: argparse.Namespace, study: PlannedStudy, pool: PoolOptions | None = None
 ) -> list[Gap]:
     """Run a study silently; return the ensembles with missing runs, none if it came to its end."""
-    from netkf.ensembles.replicas import MissingRunsError
-
     out = getattr(options, "out", None)
     with TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
         if hasattr(options, "out"):
@@ -346,8 +320,6 @@ def _missing_runs(
 def _run_on(
     run: Run, options: argparse.Namespace, study: PlannedStudy, given: PoolOptions | None = None
 ) -> int:
-    from netkf.ensembles.pools import PoolOptions, make_pool
-
     given = given or PoolOptions(1)
     with make_pool(given.workers or 1, given) as pool:
         pool.plan = study
@@ -357,8 +329,6 @@ def _run_on(
 
 def _print_missing(plan: Plan, gaps: list[Gap], rounds: bool = False) -> None:
     """Print which runs have no result, and what to do."""
-    from netkf.ensembles.replicas import missing_ranges
-
     short = [gap for gap in gaps if gap.missing]
     missing = sum(len(runs) for gap in short for runs in gap.missing)
     total = sum(gap.runs for gap in gaps)
@@ -381,8 +351,6 @@ def _print_missing(plan: Plan, gaps: list[Gap], rounds: bool = False) -> None:
 
 def _missing_parts(gaps: list[Gap], tasks: int) -> set[int]:
     """Return the numbers of those of ``tasks`` parts that have missing runs."""
-    from netkf.ensembles.parts import Part
-
     parts: set[int] = set()
     starts = {gap.runs: [Part(k, tasks).of(gap.runs).start for k in range(tasks)] for gap in gaps}
     for gap in gaps:

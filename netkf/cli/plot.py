@@ -13,11 +13,11 @@ from netkf.core.errors import ScenarioError, suggest_nearest
 from netkf.core.extras import missing
 from netkf.core.printable import shorten
 from netkf.figures.names import FIGURE_NAMES, FIT_FIGURES, FIT_FILE, FORMATS, is_picture
+from netkf.runs.files import require_own
+from netkf.studies.opening import open as open_directory
 
 
 def _run(options: argparse.Namespace) -> int:
-    from netkf.studies.opening import open as open_directory
-
     if find_spec("matplotlib") is None:
         raise missing("matplotlib", "plot", "plot")
     # Empty: all figures.
@@ -65,8 +65,6 @@ def _run(options: argparse.Namespace) -> int:
 
 def _check_output(out: Path, directories: int, file_format: str | None) -> None:
     """Raise ScenarioError or WriteError if ``out`` cannot hold the figures."""
-    from netkf.runs.files import require_own
-
     suffix = out.suffix.removeprefix(".").lower()
     if file_format and suffix in FORMATS and suffix != file_format:
         rule = f"is not that of {shorten(out)}"

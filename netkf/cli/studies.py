@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 from functools import partial
-from typing import TYPE_CHECKING
 
 from netkf.cli import pictures
 from netkf.cli.options import (
@@ -20,19 +19,19 @@ from netkf.cli.options import (
 from netkf.cli.progress import ProgressLine
 from netkf.core.errors import ScenarioError
 from netkf.core.printable import count_phrase
-
-if TYPE_CHECKING:
-    from netkf.scenario.scenario import Scenario
-    from netkf.studies.sweep import CompletedSweep
+from netkf.ensembles.pools import PoolOptions
+from netkf.runs.files import lock_directory
+from netkf.scenario.scenario import Scenario
+from netkf.scenario.values import parse_values
+from netkf.studies.compare_filters import compare_filters, write_comparison
+from netkf.studies.parameter_grid import parse_grid, parse_interval
+from netkf.studies.size import size
+from netkf.studies.sweep import CompletedSweep, plan_sweep, sweep_to_directory
+from netkf.studies.tables import format_answer, format_filters, format_sizing, format_sweep
 
 
 def run_sweep(options: argparse.Namespace) -> int:
     """``netkf sweep``: simulate every point of a grid of parameters."""
-    from netkf.ensembles.pools import PoolOptions
-    from netkf.runs.files import lock_directory
-    from netkf.studies.parameter_grid import parse_grid
-    from netkf.studies.sweep import plan_sweep, sweep_to_directory
-
     fixed = [setting.partition("=")[0].strip() for setting in options.set]
     fixed += ["seed"] if options.seed is not None else []
     grid, scenario = parse_grid(options.vary, fixed), load_scenario(options)
@@ -60,8 +59,6 @@ def run_sweep(options: argparse.Namespace) -> int:
 def _print_sweep(
     scenario: Scenario, completed: CompletedSweep, options: argparse.Namespace
 ) -> None:
-    from netkf.studies.tables import format_sweep
-
     print_table_notes(scenario)
     if options.json:
         rows = completed.table.to_dict("records")
@@ -79,10 +76,6 @@ def _print_sweep(
 
 def run_size(options: argparse.Namespace) -> int:
     """``netkf size``: find the smallest (or largest) value of a key that meets a target."""
-    from netkf.studies.parameter_grid import parse_interval
-    from netkf.studies.size import size
-    from netkf.studies.tables import format_answer, format_sizing
-
     if len(options.vary) > 1:
         remedy = "size searches one key; sweep varies several"
         raise ScenarioError("--vary", "is given more than once", options.vary, remedy)
@@ -118,17 +111,11 @@ def run_size(options: argparse.Namespace) -> int:
 
 def run_compare_filters(options: argparse.Namespace) -> int:
     """``netkf compare-filters``: several filters on one truth and one network."""
-    from netkf.runs.files import lock_directory
-
     with lock_directory(options.out, must_be_empty=True):
         return _compare_filters(options)
 
 
 def _compare_filters(options: argparse.Namespace) -> int:
-    from netkf.scenario.values import parse_values
-    from netkf.studies.compare_filters import compare_filters, write_comparison
-    from netkf.studies.tables import format_filters
-
     filters = parse_values("--filters", "filters", options.filters)
     scenario = load_scenario(options)
     with ProgressLine() as line:

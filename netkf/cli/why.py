@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from netkf.cli.options import print_json, print_notes
 from netkf.core.errors import ScenarioError
 from netkf.core.printable import shorten
-
-if TYPE_CHECKING:
-    from netkf.trace.run import Run
+from netkf.report.directories import read_source
+from netkf.runs.files import lock_directory, write_json, write_text
+from netkf.studies.why import why
+from netkf.trace.run import Run
 
 
 def _run(options: argparse.Namespace) -> int:
-    from netkf.runs.files import lock_directory
-
     if (options.node is None) != (options.at is None):
         remedy = "give both, or neither for the worst sample"
         raise ScenarioError("why", "takes --node and --at together", None, remedy)
@@ -25,9 +23,6 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _explain(options: argparse.Namespace) -> int:
-    from netkf.runs.files import write_json, write_text
-    from netkf.studies.why import why
-
     run: Run | Path = options.directory
     node, at, notes = options.node, options.at, []
     if node is None:
@@ -60,8 +55,6 @@ def _explain(options: argparse.Namespace) -> int:
 
 def _find_worst_sample(options: argparse.Namespace) -> tuple[Run, int, float, str]:
     """Return run, node and time (s) of the worst sample after the start-up, and a note on it."""
-    from netkf.report.directories import read_source
-
     source = read_source(options.directory, options.replica, options.trust)
     samples = source.worst
     if samples is None or source.run is None:
