@@ -21,18 +21,9 @@ ONE_THREAD = ("check", "work", "merge")
 """Commands whose runs have the same last digits here and in workers, whose LAPACK has one thread.
 """
 SHARED = {
-    "short": (
-        "compare",
-        "consistency",
-        "import",
-        "innovations",
-        "new",
-        "report",
-        "schema",
-        "theory",
-    ),
-    "planned": ("plan", "work", "merge"),
-    "studies": ("sweep", "size", "compare_filters"),
+    "short": "compare consistency import innovations new report schema theory",
+    "planned": "plan work merge",
+    "studies": "sweep size compare_filters",
 }
 """Modules of several commands, which have ``run_NAME``."""
 BESIDE = (("tasks", "plan"), ("slurm", "plan"), ("time", "slurm"), ("most", "until"))
@@ -89,9 +80,9 @@ class Command(NamedTuple):
     def _run(self, options: argparse.Namespace) -> int:
         # Only now, so that ``netkf --help`` and usage errors do not wait for numpy and numba.
         name = self.name.replace("-", "_")
-        shared = next((module for module, names in SHARED.items() if name in names), "")
-        module: Any = import_module(f"netkf.cli.{shared or name}")
-        run = getattr(module, f"run_{name}" if shared else "_run")
+        file = next((module for module, names in SHARED.items() if name in names.split()), name)
+        module: Any = import_module(f"netkf.cli.{file}")
+        run = getattr(module, "_run" if file == name else f"run_{name}")
         if getattr(options, "plan", None) is not None:
             from netkf.cli.planned import plan_study
 
@@ -207,6 +198,7 @@ def _trust(folder: str) -> Option:
 
 
 _flag = partial(_option, action="store_true")
+_directory = partial(_option, "directory", type=Path, metavar="DIR")
 _directories = partial(_option, "directories", type=Path, nargs="+", metavar="DIR")
 _runs = partial(_option, "--runs", type=parse_count)
 _out = partial(_option, "--out", type=Path)
@@ -242,7 +234,6 @@ TRACE = _option(
     "--trace",
     "runs that keep tables of events and states (default: full for one run, else first)",
     choices=["full", "first", "none"],
-    default="first",
 )
 ARRAY = (
     _option("--tasks", "number of jobs of the plan (default: 64)", type=parse_count),
@@ -263,7 +254,7 @@ PLAN = (
     ),
     *ARRAY,
 )
-PLANNED = _option("directory", "directory of a plan", type=Path, metavar="DIR")
+PLANNED = _directory("directory of a plan")
 JSON = _flag("--json", "print one JSON document only")
 ALL = _flag("--all", "show all rows with all that they say")
 NO_PLOT = _flag("--no-plot", "do not draw a picture")
@@ -280,7 +271,7 @@ COMMANDS = (
             ENGINE,
             _out("directory of the run (default: runs/NAME-k)"),
             POOL,
-            TRACE._replace(settings={**TRACE.settings, "default": None}),
+            TRACE,
             _flag("--resume", "continue the runs of --out that were stopped"),
             NO_PLOT,
         ),
@@ -475,7 +466,7 @@ COMMANDS = (
         "explain the estimate of a node at a time: the messages that it received, and those "
         "missing",
         (
-            _option("directory", "run directory", type=Path, metavar="DIR"),
+            _directory("run directory"),
             _option("--node", "id or name (default: the worst node)", type=parse_node, metavar="I"),
             _option("--at", "seconds (default: its worst sample)", type=float, metavar="T"),
             _replica("run of an ensemble with all traces (default: 0)"),
@@ -557,9 +548,7 @@ COMMANDS = (
         "fit laws of losses to a recorded network, and look for its replay among their runs; "
         "or the noise of plant and sensors",
         (
-            _option(
-                "directory", "folder that import wrote, or a scenario", type=Path, metavar="DIR"
-            ),
+            _directory("folder that import wrote, or a scenario"),
             _flag("--noise", "fit the noise of plant and sensors to the readings, Q and R"),
             SCENARIO[1],
             _runs(
@@ -578,7 +567,7 @@ COMMANDS = (
         "export",
         "write a run in another form",
         (
-            _option("directory", "run directory", type=Path, metavar="DIR"),
+            _directory("run directory"),
             _option(
                 "--to",
                 "a packet log, or a scenario with recorded outcomes, positions and lives, which "

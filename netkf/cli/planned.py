@@ -81,7 +81,7 @@ def run_plan(options: argparse.Namespace) -> int:
         scenario = load_scenario(options)
         tasks = min(options.tasks or TASKS, options.runs)
         with lock_directory(options.out):
-            settings = EnsembleOptions(options.engine, options.trace)
+            settings = EnsembleOptions(options.engine, options.trace or "first")
             directory = plan_ensemble(scenario, options.runs, options.out, settings, tasks)
         _print_plan(directory, scenario, count_phrase(options.runs, "run"), tasks, options)
     return 0
