@@ -102,7 +102,7 @@ def test_a_file_system_without_locks_is_noted(tmp_path, monkeypatch, capsys):
     def refuse(opened):
         raise OSError(os.strerror(95))
 
-    monkeypatch.setattr("netkf.runs.directory_lock._lock_file", refuse)
+    monkeypatch.setattr("netkf.runs.files._lock_file", refuse)
     with lock_directory(tmp_path):
         pass
     assert "one command at a time" in capsys.readouterr().err
