@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from netkf.scenario.model import Network as Network
     from netkf.scenario.reading import load as load
     from netkf.scenario.scenario import Scenario as Scenario
-    from netkf.scenario.stamps import Time as Time
+    from netkf.scenario.time_grid import Time as Time
     from netkf.studies.compare import compare as compare
     from netkf.studies.compare_filters import compare_filters as compare_filters
     from netkf.studies.consistency import consistency as consistency
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from netkf.studies.likelihood import fit_noise as fit_noise
     from netkf.studies.likelihood import log_likelihood as log_likelihood
     from netkf.studies.opening import open as open
-    from netkf.studies.size import size as size
+    from netkf.studies.search import size as size
     from netkf.studies.sweep import sweep as sweep
     from netkf.studies.why import why as why
     from netkf.trace.run import Run as Run
@@ -64,7 +64,7 @@ _MODULE_OF = {
     "Network": "netkf.scenario.model",
     "Run": "netkf.trace.run",
     "Scenario": "netkf.scenario.scenario",
-    "Time": "netkf.scenario.stamps",
+    "Time": "netkf.scenario.time_grid",
     "compare": "netkf.studies.compare",
     "compare_filters": "netkf.studies.compare_filters",
     "consistency": "netkf.studies.consistency",
@@ -91,7 +91,7 @@ _MODULE_OF = {
     "plot": "netkf.figures.catalogue",
     "save": "netkf.runs.run",
     "simulate": "netkf.runs.simulate",
-    "size": "netkf.studies.size",
+    "size": "netkf.studies.search",
     "sweep": "netkf.studies.sweep",
     "testing": "netkf.testing",
     "theory": "netkf.theory",

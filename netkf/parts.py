@@ -162,7 +162,7 @@ from netkf.scenario.model import Metrics as Metrics
 from netkf.scenario.model import Network as Network
 from netkf.scenario.registry import KINDS as _KINDS
 from netkf.scenario.scenario import Scenario as Scenario
-from netkf.scenario.stamps import Time as Time
+from netkf.scenario.time_grid import Time as Time
 
 
 def kinds() -> dict[str, dict[str, type]]:

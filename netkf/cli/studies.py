@@ -25,7 +25,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.scenario.values import parse_values
 from netkf.studies.compare_filters import compare_filters, write_comparison
 from netkf.studies.parameter_grid import parse_grid, parse_interval
-from netkf.studies.size import size
+from netkf.studies.search import size
 from netkf.studies.sweep import CompletedSweep, plan_sweep, sweep_to_directory
 from netkf.studies.tables import format_answer, format_filters, format_sizing, format_sweep
 

@@ -16,8 +16,12 @@ from netkf.ensembles.merge_tree import Merge, MergeTree
 from netkf.linalg.compiling import seconds_spent
 from netkf.runs.failures import explain_failure
 from netkf.runs.provenance import versions
-from netkf.scenario.imports import unload_namesake
-from netkf.scenario.plugins import find_unimportable_class, unguarded_line, user_components
+from netkf.scenario.plugins import (
+    find_unimportable_class,
+    unguarded_line,
+    unload_namesake,
+    user_components,
+)
 from netkf.scenario.scenario import Scenario
 
 Task = Callable[[Scenario, int, int], Any]

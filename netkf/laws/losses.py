@@ -20,14 +20,16 @@ from netkf.laws.intervals import (
     probability_interval,
     student_interval,
 )
-from netkf.laws.ticks import MIN_EVENTS, WINDOWS, largest_correlation
-from netkf.laws.waiting import (
+from netkf.laws.ticks import (
     CELLS,
+    MIN_EVENTS,
+    WINDOWS,
     censored_ranks,
     compare_shares,
     correlate_neighbours,
     count_ranks,
     fill_in,
+    largest_correlation,
     neighbour_correlation,
 )
 from netkf.linalg.arrays import FloatArray, IntArray

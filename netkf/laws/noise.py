@@ -25,7 +25,7 @@ from netkf.laws.intervals import (
     student_interval,
 )
 from netkf.laws.losses import MIN_COUNT, MIN_RUNS
-from netkf.laws.waiting import CELLS, MIN_SEEN, cell_interval, cell_label
+from netkf.laws.ticks import CELLS, MIN_SEEN, cell_interval, cell_label
 from netkf.linalg.arrays import FloatArray, symmetric
 
 MIN_VARIANCE_SHARE = 1e-10

@@ -23,7 +23,7 @@ from netkf.runs.tables import (
     has_bound,
 )
 from netkf.studies.compare import Comparison, Entry, quantity_label
-from netkf.studies.filter_values import JUDGED, Quantity
+from netkf.studies.metrics import JUDGED, Quantity
 from netkf.studies.opening import StoredComparison
 from netkf.trace.nees import traces
 

@@ -70,8 +70,7 @@ from netkf.scenario.block_sensors import (
 from netkf.scenario.names import bind_names
 from netkf.scenario.plugins import user_components
 from netkf.scenario.positions import placed_nodes, positions_of, table_of_positions
-from netkf.scenario.stamps import Time, restamp
-from netkf.scenario.time_grid import choose_grid, snap_limits
+from netkf.scenario.time_grid import Time, choose_grid, restamp, snap_limits
 
 EVERY_READING, HEALTHY = "every reading is used", "all sensors are healthy"
 MAX_LABELS = 12

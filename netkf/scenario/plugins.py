@@ -1,17 +1,30 @@
-"""The components of a scenario whose classes users wrote: their list, files and failures."""
+"""The classes of users that a scenario names: their import, list, files and failures, and the rule
+for files without trust.
+
+Importing a module executes it, and nothing is imported to find out what a class is. Installed
+packages offer classes by entry points of the group PARTS, whose names are kinds; every other class
+that is not netkf's own is imported with trust only.
+"""
 
 from __future__ import annotations
 
 import ast
 import dataclasses
+import importlib
 import inspect
+import os
+import site
 import sys
+import sysconfig
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import lru_cache
+from importlib.machinery import PathFinder
+from operator import attrgetter
 from pathlib import Path
-from types import CodeType, FrameType, FunctionType
-from typing import Any
+from types import CodeType, FrameType, FunctionType, ModuleType
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from netkf.core.contracts import (
     ContractError,
@@ -22,9 +35,13 @@ from netkf.core.contracts import (
     last_call,
     source_line,
 )
-from netkf.core.errors import NetkfError, quote
+from netkf.core.errors import NetkfError, ScenarioError, quote
 from netkf.core.fields import Component, walk
+from netkf.core.stamps import TimeBase
 from netkf.plants.dynamics import CustomDynamics
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 
 def user_components(value: Any) -> list[Component]:
@@ -183,3 +200,178 @@ def describe_failure(error: BaseException) -> str:
         return f"failed: {describe_error(error)}"
     place = error_line(error)
     return f"failed with {describe_error(error)}" + (f" ({place})" if place else "")
+
+
+PARTS = "netkf.parts"
+"""The group of entry points by which installed packages offer classes."""
+REMEDY = "add --trust if you trust its author (in Python: trust=True)"
+
+
+class Origin(NamedTuple):
+    """The ``folder`` of a scenario's files, and what may be imported for it.
+
+    With ``trust`` any module may be imported, also those in that folder and the current folder;
+    else only classes that installed packages offer. Without ``imports`` nothing is imported: a
+    class that is not loaded yet is None. ``stamps`` says how its tables are read.
+    """
+
+    folder: Path
+    trust: bool = True
+    imports: bool = True
+    stamps: TimeBase = TimeBase()
+
+
+def find_class(kind: str, origin: Origin) -> Any:
+    """Return the object that ``kind``, "package.module:Class", names; None if it is not loaded and
+    ``origin.imports`` is false. Raises ScenarioError if it may not or cannot be imported.
+    """
+    module_name, _, class_name = kind.partition(":")
+    if module_name.partition(".")[0] != "netkf":
+        if not origin.trust:
+            rule = "names a class of a module whose code would run"
+            raise ScenarioError("kind", rule, kind, REMEDY)
+    elif module_name not in {*sys.modules, PARTS}:
+        # The modules of all classes for scenarios are loaded; no other code may be run.
+        raise _import_error(kind, ModuleNotFoundError(f"No module named {module_name!r}"))
+    if not origin.imports:
+        module = sys.modules.get(module_name)
+        if not hasattr(module, class_name) or _is_namesake(module, module_name, origin.folder):
+            return None
+    folders = (str(origin.folder), str(Path.cwd()))
+    path = [*(folder for folder in folders if folder not in sys.path), *sys.path]
+
+    def load() -> Any:
+        unload_namesake(module_name, origin.folder)
+        return getattr(importlib.import_module(module_name), class_name)
+
+    return _load(kind, load, path, module_name)
+
+
+def find_offered_class(kind: str, origin: Origin) -> Any:
+    """Return the class that a package offers as ``kind``; None if it is not loaded and
+    ``origin.imports`` is false. Raises ScenarioError if none, or several, offer it.
+    """
+    path = sys.path if origin.trust else _installed_path(origin.folder)
+    offers = [entry for entry in _offers(tuple(path)) if entry.name == kind]
+    if not offers:
+        rule = "names a class of a package in the scenario's or the current folder"
+        raise ScenarioError("kind", rule, kind, REMEDY)
+    if len(offers) > 1:
+        values = sorted(entry.value for entry in offers)
+        rule = f"is offered by several packages, as {', '.join(values)}"
+        raise ScenarioError("kind", rule, kind, "uninstall one, or name the class, with --trust")
+    entry = offers[0]
+    if _is_loaded_from_elsewhere(entry, path):
+        raise _import_error(kind, ImportError("another module of that name is loaded"))
+    if not origin.imports and _loaded_class(entry) is None:
+        return None
+    return _load(kind, entry.load, list(path), entry.value)
+
+
+def offered_kinds(cls: type | None = None) -> list[str]:
+    """Return the kinds that installed packages offer, of a class ``cls`` if it is loaded."""
+    offers = _offers(tuple(sys.path))
+    return sorted({entry.name for entry in offers if cls is None or _loaded_class(entry) is cls})
+
+
+@lru_cache(maxsize=8)
+def _offers(path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
+    # Not needed for built-in kinds, and slow to import.
+    from importlib.metadata import entry_points
+
+    with _replace_import_path(list(path)):
+        return tuple(entry_points(group=PARTS))
+
+
+def _loaded_class(entry: EntryPoint) -> Any:
+    try:
+        return attrgetter(entry.attr)(sys.modules[entry.module])
+    # Not loaded, or no "package.module:Class", which is one of four errors, by the version.
+    except (AttributeError, KeyError, TypeError, ValueError, AssertionError):
+        return None
+
+
+def _is_loaded_from_elsewhere(entry: EntryPoint, path: list[str]) -> bool:
+    """Return True if a package of the name of an offered one is loaded, but from another file."""
+    name = entry.value.partition(":")[0].partition(".")[0].strip()
+    file = getattr(sys.modules.get(name), "__file__", None)
+    spec = PathFinder.find_spec(name, path) if file is not None else None
+    if spec is None or spec.origin is None:
+        return False
+    return Path(file or "").resolve() != Path(spec.origin).resolve()
+
+
+def _load(kind: str, load: Callable[[], Any], path: list[str], target: str) -> Any:
+    with _replace_import_path(path):
+        try:
+            return load()
+        except (Exception, SystemExit) as error:
+            raise _import_error(kind, error, target) from None
+
+
+@contextmanager
+def _replace_import_path(entries: list[str]) -> Iterator[None]:
+    before = list(sys.path)
+    sys.path[:] = entries
+    try:
+        yield
+    finally:
+        sys.path[:] = [*(entry for entry in sys.path if entry not in entries), *before]
+
+
+def _import_error(kind: str, error: BaseException, target: str = "") -> ScenarioError:
+    if isinstance(error, ContractError):
+        return ScenarioError("kind", str(error), kind, "write what the contract asks for")
+    rule = f"could not be imported ({type(error).__name__}: {quote(str(error), 300)})"
+    is_missing = isinstance(error, ModuleNotFoundError) and error.name == kind.partition(":")[0]
+    remedy = "put the module beside the scenario file or on the Python path"
+    if not is_missing:
+        module = target.partition(":")[0].strip()
+        place = error_line(error, module.partition(".")[0]) or module
+        remedy = f"correct the module, {place}" if place else "correct the module"
+    return ScenarioError("kind", rule, kind, remedy)
+
+
+def unload_namesake(module_name: str, folder: Path) -> None:
+    """Remove a loaded module if another file of its name is in ``folder``, that of a scenario."""
+    if _is_namesake(sys.modules.get(module_name), module_name, folder):
+        del sys.modules[module_name]
+        importlib.invalidate_caches()
+
+
+def _is_namesake(module: ModuleType | None, module_name: str, folder: Path) -> bool:
+    """Return True if ``folder`` has a module of this name and the loaded one is not that file."""
+    file_in_folder = folder / f"{module_name}.py"
+    if module is None or not file_in_folder.exists():
+        return False
+    file = getattr(module, "__file__", None)
+    return file is None or not Path(file).exists() or not file_in_folder.samefile(file)
+
+
+def _installed_path(folder: Path) -> list[str]:
+    """Return the import path without ``folder``, that of a scenario, and the current folder."""
+    text = "" if sys.flags.ignore_environment else os.environ.get("PYTHONPATH", "")
+    entries = [entry for entry in text.split(os.pathsep) if entry]
+    relative = {Path(entry).resolve() for entry in entries if not os.path.isabs(entry)}
+    absolute = {Path(entry).resolve() for entry in entries if os.path.isabs(entry)}
+    barred = {folder.resolve(), Path.cwd().resolve(), *relative}
+    barred -= {*absolute, *_package_folders(), *_path_file_folders()}
+    return [entry for entry in sys.path if Path(entry).resolve() not in barred]
+
+
+def _package_folders() -> list[Path]:
+    paths = sysconfig.get_paths()
+    folders = {paths["purelib"], paths["platlib"], *site.getsitepackages()}
+    if site.ENABLE_USER_SITE:
+        folders.add(site.getusersitepackages())
+    return sorted(Path(folder).resolve() for folder in folders)
+
+
+def _path_file_folders() -> Iterator[Path]:
+    """Yield the folders that ``.pth`` files add to the import path, as editable installs do."""
+    for folder in _package_folders():
+        for file in sorted(folder.glob("*.pth")):
+            # A line of a .pth file is a folder, a comment, or code that begins with "import".
+            for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
+                if line.strip() and not line.startswith(("#", "import ", "import\t")):
+                    yield (folder / line.strip()).resolve()

@@ -11,7 +11,7 @@ from typing import Any
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import as_path, boolean
-from netkf.scenario.imports import Origin
+from netkf.scenario.plugins import Origin
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import MAX_DEPTH, build_scenario, change_table, explain_left_over
 

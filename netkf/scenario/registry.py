@@ -48,7 +48,7 @@ from netkf.plants.relative import (
 )
 from netkf.plants.sampling import RecordedSampling
 from netkf.plants.sensors import LinearSensor, Sensor
-from netkf.scenario.imports import Origin, find_class, find_offered_class, offered_kinds
+from netkf.scenario.plugins import Origin, find_class, find_offered_class, offered_kinds
 
 FAMILIES: dict[str, type[Component]] = {
     "plant": Plant,

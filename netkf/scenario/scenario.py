@@ -16,9 +16,8 @@ from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.plugins import explained
 from netkf.scenario.records import record_notes
 from netkf.scenario.sampling import sampling_notes
-from netkf.scenario.stamps import stamp_notes
 from netkf.scenario.tables import change_keys
-from netkf.scenario.time_grid import grid_notes
+from netkf.scenario.time_grid import grid_notes, stamp_notes
 from netkf.scenario.usage import repeat_notes
 
 

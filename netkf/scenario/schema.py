@@ -29,12 +29,12 @@ from netkf.plants.linear import LinearPlant
 from netkf.plants.maps import NonlinearPlant
 from netkf.plants.plant import Plant
 from netkf.plants.sensors import Sensor
-from netkf.scenario.imports import offered_kinds
 from netkf.scenario.model import Belief, Filtering, Metrics, Network, ScenarioModel
+from netkf.scenario.plugins import offered_kinds
 from netkf.scenario.registry import KINDS, list_kinds
 from netkf.scenario.scenario import Scenario
-from netkf.scenario.stamps import Time
 from netkf.scenario.tables import FORMAT
+from netkf.scenario.time_grid import Time
 from netkf.scenario.writing import part_as_table, toml_text
 
 Schema = dict[str, Any]

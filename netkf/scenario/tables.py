@@ -28,11 +28,10 @@ from netkf.network.scheduled import Hopping
 from netkf.plants.blocks import Block
 from netkf.plants.states import state_file
 from netkf.scenario.derived import DerivedScenario
-from netkf.scenario.imports import Origin, find_class
 from netkf.scenario.model import Belief, Filtering, Metrics, Network
-from netkf.scenario.plugins import explain_user_error
+from netkf.scenario.plugins import Origin, explain_user_error, find_class
 from netkf.scenario.registry import KINDS, SLOTTED, find_kind, list_names_of_kind
-from netkf.scenario.stamps import Time
+from netkf.scenario.time_grid import Time
 from netkf.scenario.writing import as_table, part_as_table
 
 FORMAT = 1  # version of scenario files

@@ -29,12 +29,12 @@ from netkf.runs.parquet_files import write_table
 from netkf.runs.provenance import versions
 from netkf.runs.quantities import NETWORK, sample_names
 from netkf.runs.simulate import choose_engine, require_scenario
-from netkf.scenario.imports import offered_kinds
+from netkf.scenario.plugins import offered_kinds
 from netkf.scenario.registry import list_kinds, name_of
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import check_filter_table
 from netkf.scenario.writing import as_table, part_as_table
-from netkf.studies.filter_values import (
+from netkf.studies.metrics import (
     JUDGED,
     VALUES,
     FilterValues,
@@ -44,9 +44,9 @@ from netkf.studies.filter_values import (
     credibility,
     curve_rows,
     estimate_quantities,
+    join_batches,
     mean_curve,
 )
-from netkf.studies.metrics import join_batches
 from netkf.trace.run import plot_by_name
 
 if TYPE_CHECKING:

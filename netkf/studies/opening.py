@@ -29,7 +29,7 @@ from netkf.runs.stored import MANIFEST_FORM, StoredRun, read_checked_document, r
 from netkf.scenario.reading import load
 from netkf.scenario.scenario import Scenario
 from netkf.studies.compare_filters import CURVES, ComparedFilter, FilterComparison
-from netkf.studies.filter_values import Quantity
+from netkf.studies.metrics import Quantity
 from netkf.trace.run import plot_by_name
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from netkf.runs.tables import (
 from netkf.studies.compare import Comparison
 from netkf.studies.compare_filters import ComparedFilter, FilterComparison
 from netkf.studies.consistency import Consistency
-from netkf.studies.filter_values import JUDGED, Quantity
+from netkf.studies.metrics import JUDGED, Quantity
 from netkf.studies.search import Sizing
 
 if TYPE_CHECKING:

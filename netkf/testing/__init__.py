@@ -9,8 +9,8 @@ from netkf.testing.assertions import assert_promises as assert_promises
 from netkf.testing.assertions import scenario_files as scenario_files
 from netkf.testing.channels import check_channel as check_channel
 from netkf.testing.clocks import check_clock as check_clock
+from netkf.testing.clocks import check_matching as check_matching
 from netkf.testing.filters import check_filter as check_filter
-from netkf.testing.matchings import check_matching as check_matching
 from netkf.testing.plants import check_plant as check_plant
 from netkf.testing.sensors import check_sensor as check_sensor
 

@@ -30,13 +30,16 @@ from netkf.laws.intervals import (
     student_interval,
 )
 from netkf.laws.ticks import (
+    CELLS,
     ClockGroup,
+    censored_ranks,
+    compare_shares,
     correlation_of_columns,
     count_interval,
+    count_ranks,
     count_ticks,
     largest_correlation,
 )
-from netkf.laws.waiting import CELLS, censored_ranks, compare_shares, count_ranks
 from netkf.network.clocks import Poisson, Renewal
 
 LEVEL, TRIALS = 0.01, 300

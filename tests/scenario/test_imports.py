@@ -12,7 +12,7 @@ import pytest
 
 import netkf
 from netkf.cli.main import main
-from netkf.scenario import imports
+from netkf.scenario import plugins
 from netkf.scenario.plugins import find_module_files
 from netkf.scenario.writing import as_table, to_toml
 from tests.conftest import SCENARIOS
@@ -194,8 +194,8 @@ def site(folder, monkeypatch):
     """A folder of installed packages inside the stranger's folder, as that of a .venv can be."""
     place = folder / ".venv" / "site-packages"
     place.mkdir(parents=True)
-    folders = imports._package_folders()
-    monkeypatch.setattr(imports, "_package_folders", lambda: [*folders, place.resolve()])
+    folders = plugins._package_folders()
+    monkeypatch.setattr(plugins, "_package_folders", lambda: [*folders, place.resolve()])
     monkeypatch.syspath_prepend(place)
     return place
 

@@ -15,7 +15,7 @@ from netkf.cli.main import main
 from netkf.scenario.reading import from_table
 from netkf.scenario.tables import as_table
 from netkf.studies.compare_filters import write_comparison
-from netkf.studies.filter_values import FilterValues, credibility
+from netkf.studies.metrics import FilterValues, credibility
 from netkf.studies.tables import format_filters
 from tests.conftest import SCENARIOS
 

@@ -12,9 +12,8 @@ import pytest
 import scipy.special
 
 from netkf.laws.intervals import interval_of_squares, student_interval
-from netkf.studies import filter_values, targets
-from netkf.studies.filter_values import FilterValues, estimate_quantities
-from netkf.studies.metrics import RunMetrics
+from netkf.studies import metrics, targets
+from netkf.studies.metrics import FilterValues, RunMetrics, estimate_quantities
 from netkf.studies.targets import Target, quantity_by_simulation
 
 TRIALS, RUNS = 6_000, 5
@@ -83,9 +82,9 @@ def searched(trials):
     found = {name: [] for name in truths}
     for _ in range(trials):
         square, trace = (drawn(random, BEFORE)[:, None] for _ in range(2))
-        metrics = RunMetrics(square, trace, np.zeros((RUNS, 5)), nothing, nothing + np.inf)
+        of_runs = RunMetrics(square, trace, np.zeros((RUNS, 5)), nothing, nothing + np.inf)
         for name, intervals in found.items():
-            estimate = quantity_by_simulation(metrics, Target(name, 1.0), MISS, None)
+            estimate = quantity_by_simulation(of_runs, Target(name, 1.0), MISS, None)
             intervals.append((estimate.low, estimate.high))
     return {f"size {name}": count(found[name], truth) for name, truth in truths.items()}
 
@@ -122,9 +121,7 @@ class Scipy:
 
 @pytest.mark.one_in(4)
 @pytest.mark.parametrize("special", [OneSided, Normal])
-@pytest.mark.parametrize(
-    ("module", "name"), [(filter_values, "compare_filters"), (targets, "size")]
-)
+@pytest.mark.parametrize(("module", "name"), [(metrics, "compare_filters"), (targets, "size")])
 def test_a_wrong_quantile_is_found(module, name, special, monkeypatch):
     monkeypatch.setattr(module, "scipy", Scipy(special))
     assert {found.split()[0] for found, _ in wrong_sides(1500)} == {name}

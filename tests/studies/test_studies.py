@@ -30,7 +30,7 @@ from netkf.studies.metrics import (
     join_batches,
 )
 from netkf.studies.parameter_grid import parse_grid, parse_interval, table_column
-from netkf.studies.size import size
+from netkf.studies.search import size
 from netkf.studies.sweep import plan_sweep, sweep, sweep_to_directory
 from netkf.studies.tables import format_answer, format_sweep
 from netkf.studies.targets import Target, parse_target, quantity_by_simulation

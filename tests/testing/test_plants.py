@@ -18,7 +18,7 @@ from netkf.testing import (
 )
 from netkf.testing import plants as of_plants
 from netkf.testing import sensors as of_sensors
-from netkf.testing.matchings import _check_matching
+from netkf.testing.clocks import _check_matching
 from netkf.testing.plants import _check_plant
 from netkf.testing.sensors import _check_sensor
 from tests.conftest import with_slow

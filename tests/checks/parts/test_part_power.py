@@ -18,8 +18,7 @@ from netkf.checks.parts.network_rows import (
 from netkf.laws.intervals import correlation_interval, deviation_interval, probability_interval
 from netkf.laws.losses import PairCounts, count_outcomes, mean_correlation
 from netkf.laws.noise import _between, _in_size, _in_time
-from netkf.laws.ticks import largest_correlation
-from netkf.laws.waiting import CELLS, Ranks, correlate_neighbours
+from netkf.laws.ticks import CELLS, Ranks, correlate_neighbours, largest_correlation
 from netkf.scenario.reading import from_table
 from tests.checks.parts.test_parts import SLOTS
 

@@ -25,8 +25,7 @@ from netkf.laws.noise import (
     noise_draws,
     whiten,
 )
-from netkf.laws.ticks import ClockGroup, count_ticks
-from netkf.laws.waiting import CELLS
+from netkf.laws.ticks import CELLS, ClockGroup, count_ticks
 from netkf.parts import (
     ConstantDelay,
     ExponentialDelay,
