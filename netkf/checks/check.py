@@ -27,7 +27,9 @@ from netkf.checks.equations import OF_EQUATIONS, UNDER_CLOCKS, WITHOUT_PAPER
 from netkf.checks.evidence import (
     BASE,
     BROKEN,
+    EPS,
     NOT_PROMISED,
+    OPERATIONS,
     UNDECIDED,
     VERDICTS,
     Assumption,
@@ -44,11 +46,9 @@ from netkf.checks.paper import PaperChecks
 from netkf.checks.parts.events import stack_parts, summarise_parts
 from netkf.checks.parts.network_rows import loss_assumptions
 from netkf.checks.parts.rows import gaussian_noises, part_promises
-from netkf.checks.points import check_slots, probe_times
 from netkf.checks.records.rows import audit_record, audit_run, record_promises
 from netkf.checks.results import RESULTS_FORM, ReplicaResult
-from netkf.checks.rounding import EPS, OPERATIONS
-from netkf.checks.samples import stack_summaries
+from netkf.checks.samples import check_slots, probe_times, stack_summaries
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import integer, number, require_runs
 from netkf.core.notebook import NotebookTable

@@ -29,8 +29,13 @@ from netkf.checks.exact import (
 )
 from netkf.checks.laws import LAW_TOLERANCE, Pair, compare_growth
 from netkf.checks.paper import PaperChecks, usual_assumptions
-from netkf.checks.points import sampled_indices
-from netkf.checks.samples import ReplicaSummary, RunSamples, check_growth, check_replay
+from netkf.checks.samples import (
+    ReplicaSummary,
+    RunSamples,
+    check_growth,
+    check_replay,
+    sampled_indices,
+)
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.rng.streams import Streams

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from netkf.algorithms.traits import nothing_conserved
-from netkf.checks.evidence import Assumption, Finding, Promise, find_unknown
+from netkf.checks.evidence import Assumption, Finding, Promise, compare_identities, find_unknown
 from netkf.checks.exact import (
     check_bias,
     check_error_covariance,
@@ -26,9 +26,14 @@ from netkf.checks.exact import (
 )
 from netkf.checks.laws import exact_start
 from netkf.checks.paper import PaperChecks
-from netkf.checks.points import check_slots, checked_samples, sampled_indices
-from netkf.checks.rounding import compare_identities
-from netkf.checks.samples import ReplicaSummary, RunSamples, check_replay
+from netkf.checks.samples import (
+    ReplicaSummary,
+    RunSamples,
+    check_replay,
+    check_slots,
+    checked_samples,
+    sampled_indices,
+)
 from netkf.core.errors import TheoryError
 from netkf.network.clocks import LinkClock
 from netkf.scenario.records import unjudged_line

@@ -18,6 +18,8 @@ import scipy
 
 from netkf.algorithms.registry import LINK_WEIGHTS, base_filter, built_in_class, own_attributes
 from netkf.checks.evidence import (
+    EPS,
+    OPERATIONS,
     Assumption,
     Finding,
     error_test,
@@ -26,15 +28,16 @@ from netkf.checks.evidence import (
     gaussian_test,
 )
 from netkf.checks.laws import EVERYTHING, NEES_TOLERANCE, compare_chi_square, find_largest, pool
-from netkf.checks.points import (
+from netkf.checks.samples import (
+    ReplicaSummary,
+    RunSamples,
     check_slots,
     checked_samples,
+    compare_points,
     errors_at_once,
     probe_times,
     sampled_indices,
 )
-from netkf.checks.rounding import EPS, OPERATIONS
-from netkf.checks.samples import ReplicaSummary, RunSamples, compare_points
 from netkf.checks.statistics import quadratic_interval
 from netkf.core.errors import TheoryError
 from netkf.laws.intervals import (

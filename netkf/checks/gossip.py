@@ -36,8 +36,14 @@ from netkf.checks.mode_sequences import (
     trace_tokens,
 )
 from netkf.checks.paper import PaperChecks, usual_assumptions
-from netkf.checks.points import all_sampled, check_slots, sampled_indices
-from netkf.checks.samples import ReplicaSummary, check_replay, compare_points
+from netkf.checks.samples import (
+    ReplicaSummary,
+    all_sampled,
+    check_replay,
+    check_slots,
+    compare_points,
+    sampled_indices,
+)
 from netkf.checks.statistics import band_around, band_width, round_digits
 from netkf.core.errors import TheoryError
 from netkf.laws.intervals import deviation_interval, probability_interval

@@ -23,8 +23,7 @@ from netkf.checks.evidence import (
 from netkf.checks.exact import check_expected_nees, check_upper_bound, with_promised_filter
 from netkf.checks.laws import find_largest
 from netkf.checks.paper import PaperChecks, usual_assumptions
-from netkf.checks.points import check_times, sampled_indices
-from netkf.checks.samples import RunSamples, check_replay
+from netkf.checks.samples import RunSamples, check_replay, check_times, sampled_indices
 from netkf.checks.statistics import affine, eigenvalue_interval
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.laws.intervals import Interval

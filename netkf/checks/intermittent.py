@@ -12,7 +12,7 @@ import numpy as np
 
 from netkf.algorithms.kernels.chains import trace_paths
 from netkf.checks.equations import error_promises
-from netkf.checks.evidence import COMPUTED, Assumption, Finding, Promise
+from netkf.checks.evidence import COMPUTED, Assumption, Finding, Promise, compare_identities
 from netkf.checks.exact import check_nees, summarise_exactly
 from netkf.checks.laws import FIXED_READINGS, LAW_TOLERANCE, find_largest, fixed_readings
 from netkf.checks.mode_sequences import (
@@ -31,9 +31,14 @@ from netkf.checks.mode_sequences import (
     sensing_neighbours,
 )
 from netkf.checks.paper import PaperChecks, usual_assumptions
-from netkf.checks.points import check_slots, sampled_indices, sampled_nodes
-from netkf.checks.rounding import compare_identities
-from netkf.checks.samples import ReplicaSummary, check_replay, compare_points
+from netkf.checks.samples import (
+    ReplicaSummary,
+    check_replay,
+    check_slots,
+    compare_points,
+    sampled_indices,
+    sampled_nodes,
+)
 from netkf.checks.statistics import distance_to_law, law_distance, pearson_test
 from netkf.core.errors import TheoryError
 from netkf.laws.intervals import deviation_interval, probability_interval

@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.checks.evidence import Assumption, Finding, find_unknown
-from netkf.checks.rounding import EPS, OPERATIONS
+from netkf.checks.evidence import EPS, OPERATIONS, Assumption, Finding, find_unknown
 from netkf.checks.statistics import law_distance, law_excess
 from netkf.laws.intervals import Interval, LawComparison, deviation_interval, scale_interval
 from netkf.linalg.arrays import FloatArray

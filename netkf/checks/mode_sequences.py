@@ -26,8 +26,7 @@ from netkf.checks.laws import (
     diagonal_distances,
     growth_intervals,
 )
-from netkf.checks.points import MAX_NODES, check_slots, sampled_nodes
-from netkf.checks.samples import RunSamples
+from netkf.checks.samples import MAX_NODES, RunSamples, check_slots, sampled_nodes
 from netkf.linalg.arrays import FloatArray, block_diagonal, square_root
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run

@@ -30,8 +30,13 @@ from netkf.checks.exact import (
 )
 from netkf.checks.laws import find_largest
 from netkf.checks.paper import PaperChecks, usual_assumptions
-from netkf.checks.points import sampled_indices
-from netkf.checks.samples import REPLAY_TOLERANCE, RunSamples, check_replay, relative_difference
+from netkf.checks.samples import (
+    REPLAY_TOLERANCE,
+    RunSamples,
+    check_replay,
+    relative_difference,
+    sampled_indices,
+)
 from netkf.checks.statistics import affine, quadratic_interval
 from netkf.core.errors import TheoryError
 from netkf.laws.intervals import Interval, deviation_interval

@@ -20,8 +20,7 @@ from netkf.checks.equations import (
 from netkf.checks.evidence import Finding, Promise, find_identity
 from netkf.checks.exact import EXACT_TOLERANCE
 from netkf.checks.paper import PaperChecks
-from netkf.checks.points import check_slots, sampled_indices
-from netkf.checks.samples import RunSamples
+from netkf.checks.samples import RunSamples, check_slots, sampled_indices
 from netkf.core.errors import TheoryError
 from netkf.theory.track_fusion.steady_errors import tracks_in_slots
 

@@ -8,8 +8,8 @@ import shlex
 from collections.abc import Iterator
 
 from netkf.checks.check import MAX_LOOKED_RUNS, USUAL_RUNS, Verdict, check, usual_runs
-from netkf.checks.points import sampling_note
 from netkf.checks.report import verdict_json, verdict_text
+from netkf.checks.samples import sampling_note
 from netkf.checks.storage import PICTURE, clear_unfinished, load_verdict, save_verdict
 from netkf.cli import pictures
 from netkf.cli.options import FAILED, load_scenario, pool_settings, print_json, print_notes

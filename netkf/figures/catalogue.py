@@ -12,10 +12,8 @@ from netkf.figures.consistency import nees_figure, nis_figure, whiteness_figure
 from netkf.figures.error import error_figure, quantiles_figure, ratios_figure
 from netkf.figures.figure_data import FigureData, UnavailableError, reduce_result
 from netkf.figures.names import FIT_FIGURES, is_picture
-from netkf.figures.network import network_figure
-from netkf.figures.outcomes import envelope_figure, fate_figure, losses_figure, matrix_figure
+from netkf.figures.network import network_figure, plane_figure
 from netkf.figures.pictures import overview
-from netkf.figures.plane import plane_figure
 from netkf.figures.several import curves_of, errors_figure
 from netkf.figures.stability import (
     law_figure,
@@ -24,7 +22,15 @@ from netkf.figures.stability import (
     sweep_figure,
 )
 from netkf.figures.style import Picture, message_figure, style_context, write_figure
-from netkf.figures.traffic import age_figure, delivery_figure, links_figure
+from netkf.figures.traffic import (
+    age_figure,
+    delivery_figure,
+    envelope_figure,
+    fate_figure,
+    links_figure,
+    losses_figure,
+    matrix_figure,
+)
 from netkf.runs.files import make_directory
 
 FIGURES: Mapping[str, Callable[[FigureData], Picture]] = {

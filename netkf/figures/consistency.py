@@ -10,7 +10,7 @@ from netkf.checks.innovations import MIN_READINGS, Innovations, autocorrelations
 from netkf.core.errors import NetkfError
 from netkf.figures import style
 from netkf.figures.figure_data import FigureData, UnavailableError
-from netkf.figures.panels import draw_nees
+from netkf.figures.style import draw_nees
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.summary import CONFIDENCE, NORMAL_QUANTILE, chi_square_interval, nees_bounds
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from netkf.figures.consistency import draw_nis, require_innovations
 from netkf.figures.figure_data import FigureData, UnavailableError
-from netkf.figures.panels import draw_covariances, draw_errors
 from netkf.figures.style import (
     EXACT,
     FAINT,
@@ -18,6 +17,8 @@ from netkf.figures.style import (
     SECONDS,
     SENSING,
     Picture,
+    draw_covariances,
+    draw_errors,
     draw_legend,
     draw_message,
     finish_figure,

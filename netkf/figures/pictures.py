@@ -6,7 +6,7 @@ from netkf.ensembles.directory import FinishedEnsemble
 from netkf.figures import style
 from netkf.figures.figure_data import FigureData, reduce_completed_run, reduce_ensemble
 from netkf.figures.network import draw_network, error_label, explain_network, node_values
-from netkf.figures.panels import draw_covariances, draw_errors, draw_nees
+from netkf.figures.style import draw_covariances, draw_errors, draw_nees
 from netkf.runs.run import CompletedRun
 from netkf.scenario.scenario import Scenario
 

@@ -13,11 +13,15 @@ from netkf.checks.innovations import Innovations
 from netkf.core.printable import count_phrase
 from netkf.engines.soundness import describe_divergence
 from netkf.linalg.arrays import FloatArray
-from netkf.report.data import information_age
-from netkf.report.directories import ReportSource
-from netkf.report.innovations import describe_innovations
-from netkf.report.replicas import describe_replica
-from netkf.report.worst import StartUp, WorstSample, WorstSamples, summary_samples
+from netkf.report.data import describe_innovations, information_age
+from netkf.report.directories import (
+    ReportSource,
+    StartUp,
+    WorstSample,
+    WorstSamples,
+    describe_replica,
+    summary_samples,
+)
 from netkf.runs.outcomes import downtimes
 from netkf.runs.stored import StoredRun
 from netkf.runs.summary import CONFIDENCE

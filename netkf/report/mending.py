@@ -13,9 +13,8 @@ from netkf.checks.innovations import with_filter
 from netkf.core.errors import NetkfError
 from netkf.core.printable import count_phrase
 from netkf.network.clocks import LinkClock
-from netkf.report.directories import ReportSource
+from netkf.report.directories import ReportSource, WorstSample
 from netkf.report.markup import bullets, paragraph, table_box
-from netkf.report.worst import WorstSample
 from netkf.runs.simulate import simulate
 from netkf.runs.tables import format_number
 from netkf.studies.explanation import Why, relative_change

@@ -23,9 +23,8 @@ from netkf.core.version import __version__
 from netkf.figures.names import SERIES
 from netkf.report import tables
 from netkf.report.claims import describe_differences, describe_source
-from netkf.report.data import Budget, positions, run_data, thinning_rules
+from netkf.report.data import Budget, positions, read_innovations, run_data, thinning_rules
 from netkf.report.directories import ReportSource, read_source
-from netkf.report.innovations import read_innovations
 from netkf.report.markup import Packer, bullets, content_hash, paragraph, script_json, section, text
 from netkf.report.mending import describe_central, describe_mending, explain_worst, mending_section
 from netkf.report.outcome_figure import filters_figure, outcome_figures

@@ -9,9 +9,8 @@ import numpy as np
 from scipy.special import stdtrit
 
 from netkf.core.printable import shorten
-from netkf.report.directories import ReportSource
+from netkf.report.directories import ReportSource, spread_curves
 from netkf.report.markup import bullets, paragraph, table_box
-from netkf.report.replicas import spread_curves
 from netkf.runs.files import to_json_value
 from netkf.runs.summary import CONFIDENCE, nees_bounds
 from netkf.runs.tables import (

@@ -14,7 +14,7 @@ from netkf.network.lives import lifetimes
 from netkf.network.radio import Energy, Radio
 from netkf.rng.streams import Streams
 from netkf.runs.connectivity import ConnectivitySink
-from netkf.runs.transmissions import Transmissions
+from netkf.runs.outcomes import Transmissions
 from netkf.scenario.scenario import Scenario
 from netkf.trace.ages import Ages
 from netkf.trace.recorder import Sink

@@ -23,6 +23,7 @@ from netkf.rng.streams import Streams
 from netkf.runs import files
 from netkf.runs.documents import file_digests, write_sealed
 from netkf.runs.failures import explain_failure
+from netkf.runs.outcomes import SentPerLink
 from netkf.runs.parquet_files import ParquetSink
 from netkf.runs.provenance import machine, versions
 from netkf.runs.quantities import NetworkSink
@@ -33,7 +34,6 @@ from netkf.runs.summary import (
     promise_traces,
     summarise,
 )
-from netkf.runs.transmissions import SentPerLink
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.usage import record_usage
 from netkf.trace.recorder import Fingerprint, Recorder, Sink

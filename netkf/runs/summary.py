@@ -17,8 +17,8 @@ from netkf.core.wings import WINGS
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import node_columns
 from netkf.runs.labels import covariance_notes
+from netkf.runs.outcomes import PairCounter, Transmissions
 from netkf.runs.quantities import NETWORK, quantity_rows, sample_names, sample_quantities
-from netkf.runs.transmissions import PairCounter, Transmissions
 from netkf.scenario.scenario import Scenario
 from netkf.trace.nees import blurred_from, errors, traces
 from netkf.trace.recorder import Sink

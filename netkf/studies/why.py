@@ -32,9 +32,8 @@ from netkf.studies.information import (
     rows_until,
     search_back,
 )
-from netkf.studies.message_sets import Candidate, SmallestSet, find_smallest_set
+from netkf.studies.message_sets import Candidate, Outcome, Replayer, SmallestSet, find_smallest_set
 from netkf.studies.opening import open as open_directory
-from netkf.studies.replay import Outcome, Replayer
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 

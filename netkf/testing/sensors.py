@@ -19,7 +19,6 @@ from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.rng.streams import Generators, Streams
 from netkf.scenario.plugins import describe_failure
-from netkf.testing.dynamics import check_derivatives
 from netkf.testing.noise import (
     NoiseLabels,
     check_independent,
@@ -29,6 +28,7 @@ from netkf.testing.noise import (
     family_level,
     whitened,
 )
+from netkf.testing.plants import check_derivatives
 from netkf.testing.watching import (
     ROUNDING,
     WatchedPart,

@@ -10,8 +10,7 @@ import netkf
 from netkf.algorithms.traits import Timing
 from netkf.checks import exact, statistics
 from netkf.checks.check import check
-from netkf.checks.evidence import BROKEN, HOLDS, UNDECIDED
-from netkf.checks.rounding import compare_identities
+from netkf.checks.evidence import BROKEN, HOLDS, UNDECIDED, compare_identities
 from netkf.cli.main import main
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.laws.losses import share_of_bounded_runs

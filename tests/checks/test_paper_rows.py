@@ -7,8 +7,7 @@ import pytest
 
 import netkf
 from netkf.checks import diffusion, exact, gossip, hybrid, intermittent, push_sum
-from netkf.checks.points import check_times
-from netkf.checks.samples import ReplicaSummary, stack_summaries
+from netkf.checks.samples import ReplicaSummary, check_times, stack_summaries
 from tests.conftest import SCENARIOS
 
 LEVEL = 0.01

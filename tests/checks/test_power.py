@@ -10,8 +10,13 @@ import scipy.stats
 
 from netkf.checks.check import find_checks, judge_replicas, run_replica, with_check_times
 from netkf.checks.exact import _compare_pooled, _pool_nees, check_expected_nees, max_replayed
-from netkf.checks.points import check_times, errors_at_once, probe_times
-from netkf.checks.samples import ReplicaSummary, stack_summaries
+from netkf.checks.samples import (
+    ReplicaSummary,
+    check_times,
+    errors_at_once,
+    probe_times,
+    stack_summaries,
+)
 from netkf.laws.ticks import count_interval
 from netkf.scenario.reading import load
 from netkf.theory.errors import ErrorLaw

@@ -14,7 +14,7 @@ from netkf.checks.evidence import BROKEN, NOT_PROMISED
 from netkf.checks.parts.noises import reading_labels, reading_noises, sensor_laws
 from netkf.checks.records import rows
 from netkf.checks.records.events import event_fault
-from netkf.checks.records.files import files_fault
+from netkf.checks.records.rows import files_fault
 from netkf.checks.records.states import (
     sample_fault,
     start_fault,
@@ -30,8 +30,8 @@ from netkf.engines.simpy import clocks, nodes, sensors, transmission
 from netkf.engines.simpy import engine as processes
 from netkf.laws.noise import compare_variances
 from netkf.rng.streams import Streams
+from netkf.runs import outcomes, stored, summary
 from netkf.runs import run as run_files
-from netkf.runs import stored, summary, transmissions
 from netkf.runs.parquet_files import ParquetSink
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.reading import from_table
@@ -295,7 +295,7 @@ FILES = {
     ),
     "reading": (stored, "_read_events", lambda real, *arguments: real(*arguments)[1:]),
     "transmissions": (
-        transmissions.Transmissions,
+        outcomes.Transmissions,
         "transmissions",
         lambda real, self, nodes: [count + 1 for count in real(self, nodes)],
     ),

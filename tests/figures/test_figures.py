@@ -11,12 +11,12 @@ import pytest
 import netkf
 from netkf.cli.main import main
 from netkf.ensembles.pools import PoolOptions
-from netkf.figures import plane
+from netkf.figures import network
 from netkf.figures.catalogue import FIGURES, FigureSet, plot_to_files
 from netkf.figures.names import FIGURE_NAMES
-from netkf.figures.outcomes import envelope_figure
 from netkf.figures.several import errors_figure
 from netkf.figures.style import lay_out, style_context
+from netkf.figures.traffic import envelope_figure
 from netkf.runs.curves import ErrorCurve
 from netkf.studies.sweep import plan_sweep, sweep_to_directory
 from tests.conftest import SCENARIOS, with_slow
@@ -372,7 +372,7 @@ def test_landmarks_have_the_numbers_of_the_log():
     scenario = netkf.load(SCENARIOS / "blocks" / "mrclam_small" / "scenario.toml")
     table = SCENARIOS / "data" / "mrclam_small" / "Landmark_Groundtruth.dat"
     rows = np.loadtxt(table)
-    assert plane.landmark_names(scenario) == {(x, y): f"{k:.0f}" for k, x, y, *_ in rows}
+    assert network.landmark_names(scenario) == {(x, y): f"{k:.0f}" for k, x, y, *_ in rows}
 
 
 def test_the_plane_needs_nodes_that_estimate_their_coordinates(drawing):

@@ -9,7 +9,7 @@ import scipy.stats
 import netkf
 from netkf.algorithms.models import FlowModel
 from netkf.checks.innovations import ExpectedIncrements, autocorrelation, compute_innovations
-from netkf.figures.panels import MAX_FREEDOM, nees_interval
+from netkf.figures.style import MAX_FREEDOM, nees_interval
 from netkf.figures.traffic import age_of_information, heard, messages_by_direction, wilson_interval
 from netkf.studies.consistency import replica_consistency
 from netkf.trace.messages import join_messages

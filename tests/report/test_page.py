@@ -428,7 +428,7 @@ def test_innovations_are_those_of_the_run(name, request):
 def test_what_stands_against_innovations_is_said(ring, slots, monkeypatch):
     shown = page_of(ring).shown
     assert "increments between two events of a node, the squared innovation" in shown
-    monkeypatch.setattr("netkf.report.innovations.MAX_EVENTS", 10)
+    monkeypatch.setattr("netkf.report.data.MAX_EVENTS", 10)
     shown = Page(make_page([slots])).shown
     assert "No innovations are shown: a run of more than 10 events is not replayed, and" in shown
 

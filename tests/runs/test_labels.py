@@ -50,7 +50,7 @@ def test_the_picture_uses_the_words_of_the_table(build, tmp_path):
     from matplotlib.figure import Figure
 
     from netkf.figures.figure_data import reduce_completed_run
-    from netkf.figures.panels import draw_covariances
+    from netkf.figures.style import draw_covariances
 
     scenario = weighted(build, tmp_path)
     axes = Figure().add_subplot()

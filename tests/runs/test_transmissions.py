@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import netkf
+from netkf.runs.outcomes import PairCounter, Transmissions, count_pairs
 from netkf.runs.tables import summary_table
-from netkf.runs.transmissions import PairCounter, Transmissions, count_pairs
 from netkf.trace.schema import CODES, EVENT
 from tests.conftest import scenario_files
 

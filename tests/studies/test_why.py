@@ -26,8 +26,7 @@ from netkf.studies.information import (
     rows_until,
     search_back,
 )
-from netkf.studies.message_sets import Candidate, find_smallest_set
-from netkf.studies.replay import Replayer, delivering
+from netkf.studies.message_sets import Candidate, Replayer, delivering, find_smallest_set
 from netkf.studies.why import why
 from tests.conftest import SCENARIOS
 

@@ -8,7 +8,7 @@ import scipy.sparse
 
 import netkf
 from netkf import theory
-from netkf.checks.points import MAX_NODES, sampled_indices, sampling_note
+from netkf.checks.samples import MAX_NODES, sampled_indices, sampling_note
 from netkf.core.errors import TheoryError
 from netkf.figures.layout import get_positions
 from netkf.network import graphs

@@ -9,8 +9,8 @@ import numpy as np
 import scipy
 
 from netkf.algorithms.registry import own_attributes
+from netkf.checks.evidence import EPS, OPERATIONS, allowed_deviation, largest_terms
 from netkf.checks.parts.noises import pieces_between
-from netkf.checks.rounding import EPS, OPERATIONS, allowed_deviation, largest_terms
 from netkf.linalg.arrays import FloatArray, enlarged
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
