@@ -64,8 +64,8 @@ def test_a_directory_in_use_is_refused_before_anything_runs(name, tmp_path, caps
     def runs(*_, **__):
         raise AssertionError("it runs")
 
-    monkeypatch.setattr("netkf.checks.check.check", runs)
-    monkeypatch.setattr("netkf.studies.compare_filters.compare_filters", runs)
+    monkeypatch.setattr("netkf.cli.check.check", runs)
+    monkeypatch.setattr("netkf.cli.studies.compare_filters", runs)
     (tmp_path / "mine").write_text("")
     assert main([*COMMANDS[name], "--out", str(tmp_path)]) == 2
     assert "must be a new or empty directory" in capsys.readouterr().err

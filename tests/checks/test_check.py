@@ -454,7 +454,7 @@ def test_larger_networks_take_fewer_runs(nodes, runs, tmp_path):
 def test_runs_that_are_not_given_are_the_usual_ones(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("netkf.checks.check.USUAL_RUNS", 11)
     assert check(from_table(GOSSIP, tmp_path), workers=1).runs == 11
-    monkeypatch.setattr("netkf.checks.check.usual_runs", lambda scenario: 10)
+    monkeypatch.setattr("netkf.cli.check.usual_runs", lambda scenario: 10)
     few = ["--set", "horizon=6.0", "--workers", "1"]
     assert main(["check", str(SCENARIOS / "gossip_ring.toml"), *few]) == 0
     assert "note: 10 runs, of 5 nodes; see --runs" in capsys.readouterr().err

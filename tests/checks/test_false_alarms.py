@@ -227,7 +227,7 @@ def test_an_unforeseen_exception_is_not_a_broken_promise(monkeypatch, capsys):
     def fail(*args, **options):
         raise ZeroDivisionError("unforeseen")
 
-    monkeypatch.setattr("netkf.checks.check.check", fail)
+    monkeypatch.setattr("netkf.cli.check.check", fail)
     assert main(["check", str(SCENARIOS / "threshold.toml"), "--runs", "10"]) == 2
     assert "failed with ZeroDivisionError" in capsys.readouterr().err
 

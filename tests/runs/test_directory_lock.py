@@ -86,7 +86,7 @@ def test_an_interrupted_check_says_what_is_kept(tmp_path, monkeypatch, capsys):
     assert main([*check, "--no-plot", "--out", out]) in (0, 1)
     before = (tmp_path / "out" / "verdict.json").read_bytes()
     capsys.readouterr()
-    monkeypatch.setattr("netkf.checks.check.check", interrupt)
+    monkeypatch.setattr("netkf.cli.check.check", interrupt)
     more = ["--runs", "12", "--workers", "1", "--no-plot"]
     assert main([*check[:4], *more, "--resume", "--out", out]) == 130
     (line,) = capsys.readouterr().err.splitlines()
