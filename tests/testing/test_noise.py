@@ -6,13 +6,13 @@ from functools import partial
 
 import numpy as np
 import pytest
-from netkf.testing.dynamics import check_derivatives
 
 from netkf import parts
 from netkf.laws.losses import compare_coincidences
 from netkf.testing import noise, watching
 from netkf.testing.channels import _check_channel
 from netkf.testing.clocks import _check_clock
+from netkf.testing.plants import check_derivatives
 
 LABELS = noise.NoiseLabels("Some.path", "the noise", "R")
 SEEDS = 10
