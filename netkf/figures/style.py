@@ -24,6 +24,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import TextToPath
+from matplotlib.ticker import ScalarFormatter
 
 from netkf.core.printable import one_line, shorten
 from netkf.figures.figure_data import NO_TRUTH, FigureData
@@ -192,11 +193,25 @@ def write_figure(figure: Figure, path: Path) -> None:
             figure.savefig(temporary, dpi=RESOLUTION, format=file_format, metadata=metadata)
 
 
+class WholeNumbers(ScalarFormatter):
+    """Each tick with its exponent: a common one would stand above the axis, in the legend."""
+
+    def __call__(self, value: float, pos: int | None = None) -> str:
+        """Return the label of a tick."""
+        return f"{value:.12g}" if super().get_offset() else str(super().__call__(value, pos))
+
+    def get_offset(self) -> str:
+        """Return nothing: there is no common exponent."""
+        return ""
+
+
 def draw_legend(axes: Any, columns: int | None = None) -> None:
     """Draw the legend above the axes, in ``columns`` or as many columns as fit."""
     handles, labels = axes.get_legend_handles_labels()
     if not labels:
         return
+    if type(axes.yaxis.get_major_formatter()) is ScalarFormatter:
+        axes.yaxis.set_major_formatter(WholeNumbers())
     axes.legend(
         handles,
         labels,

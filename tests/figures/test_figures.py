@@ -449,6 +449,18 @@ def test_the_names_of_the_lowest_nodes_stand_above_the_legend():
     assert all(text.get_window_extent().y0 >= legend.y1 for text in figure.axes[0].texts)
 
 
+@pytest.mark.parametrize("name", ["error", "overview", "quantiles"])
+def test_exponents_of_small_and_large_numbers_are_not_in_the_legend(name):
+    changes = {"horizon": 2.0, "plant.cov": [[1e-12, 0.0], [0.0, 1e-12]]}
+    changes |= {"plant.B": [[0.0], [1e-6]], "sensors.0.R": [[1e-12]]}
+    changes["filter.cov"] = changes["plant.cov"]
+    figure = netkf.simulate(netkf.load(SCENARIOS / "poisson_ring.toml", changes)).plot(name)
+    assert_well_laid_out(figure)
+    left = [axes.yaxis for axes in figure.axes if axes.get_legend() and axes.axison]
+    assert left
+    assert not any(axis.get_offset_text().get_text() for axis in left)
+
+
 def test_only_what_happened_stands_in_titles_and_on_axes():
     """Nobody waits where nothing is sent to it, and the axis has room for the law too."""
     run = netkf.simulate(netkf.load(SCENARIOS / "intermittent_scalar.toml"))
