@@ -22,6 +22,7 @@ from netkf.figures.style import (
     MUTED,
     SEQUENTIAL,
     Picture,
+    draw_legend,
     finish_figure,
     label_text,
     new_figure,
@@ -268,7 +269,7 @@ def plane_figure(data: FigureData) -> Picture:
     axes.margins(0.08)
     xlabel, ylabel = (_axis_label(data.scenario, d) for d in (0, 1))
     axes.set(xlabel=xlabel, ylabel=ylabel)
-    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
+    draw_legend(axes, 2)
     return finish_figure(
         figure, data.title(_headline(data, paths)), data.caption(_coverage(data, paths))
     )

@@ -198,6 +198,18 @@ def test_the_plane_has_the_names_and_units_of_its_coordinates():
         assert (axes.get_xlabel(), axes.get_ylabel()) == expected
 
 
+def test_coordinates_of_a_map_are_whole_numbers():
+    """Eastings and northings differ in their last digits."""
+    file = SCENARIOS / "blocks" / "formation.toml"
+    changes = {"plants.0.mean": [4.6e5, 5.5e6], "horizon": 3.0}
+    changes |= {f"plants.{k}.mean": [4.6e5 + k, 5.5e6] for k in range(1, 5)}
+    (axes,) = netkf.simulate(netkf.load(file, changes), engine="simpy").plot("plane").axes
+    axes.figure.draw_without_rendering()
+    assert axes.yaxis.get_offset_text().get_text() == ""
+    labels = [text.get_text() for text in axes.get_yticklabels()]
+    assert len(set(labels)) == len(labels)
+
+
 def test_an_envelope_of_equal_values_has_an_axis():
     row = {"replay": 0.0, "low": 0.0, "median": 0.0, "high": 0.0, "p": 1.0}
     rows = [row | {"law": law, "quantity": "time connected"} for law in ("bernoulli", "per-link")]
