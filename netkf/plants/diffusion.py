@@ -29,7 +29,7 @@ from netkf.plants.transitions import Transitions, decimal_below, frame_period
 from netkf.plants.tree import Tree
 from netkf.plants.truth import ChangingTruth, SampledTruth, multiples
 from netkf.rng.normals import GeneratorNormals, Normals, StreamNormals
-from netkf.rng.streams import ReplicaStreams, Streams, state_of
+from netkf.rng.streams import Streams, state_of
 
 MAX_STEP = 8.0  # norm of A times a step, beyond which the series of e^{A g} loses digits
 NO_TIMES = np.empty(0)
@@ -166,7 +166,7 @@ class Diffusion(Plant):
         return SampledTruth(self.moves, tree, start, stream, times, frame_times, frames)
 
     def sampled_states(
-        self, streams: Streams | ReplicaStreams, times: Sequence[FloatArray], horizon: float
+        self, streams: Streams, times: Sequence[FloatArray], horizon: float
     ) -> list[FloatArray]:
         """Return the states (K, n) of each run at its ``times`` (K,), in any order, as
         ``sampled_truth`` of the stream "plant" of each run has them, without frames.

@@ -139,6 +139,7 @@ class NonlinearSensor(Sensor):
     path: SourceFile | None = field(source_file, default=None)
 
     linear: ClassVar[bool] = False
+    varying = True  # the Jacobian depends on the estimate
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -198,11 +199,6 @@ class NonlinearSensor(Sensor):
         id (None: it has none), if the sensor uses them.
         """
         return self
-
-    @property
-    def varying(self) -> bool:
-        """True: the Jacobian depends on the estimate."""
-        return True
 
     def matrix_of(self, n: int) -> FloatArray:
         """Return zeros (p, n): H is unknown before there is an estimate."""

@@ -92,6 +92,8 @@ class ReadingTable:
             remedy = "write columns of one of the two forms, and rename others"
             raise ScenarioError("path", rule, foreign[0], remedy)
         self._surplus = [name for name in header if number_of(name) >= p]
+        self._rows: dict[int, NodeRows] = {}
+        self._slots: dict[tuple[int, float], dict[int, list[int]]] = {}
 
     @cached_property
     def columns(self) -> Columns:
@@ -188,10 +190,6 @@ class ReadingTable:
             self._rows[node] = self._make_rows(node)
         return self._rows[node]
 
-    @cached_property
-    def _rows(self) -> dict[int, NodeRows]:
-        return {}
-
     def _make_rows(self, node: int) -> NodeRows:
         columns, own = self.columns, self.columns["node"] == node
         for name in self._surplus:
@@ -228,10 +226,6 @@ class ReadingTable:
                 slots.setdefault(slot_number(self.columns, row, period), []).append(k)
             self._slots[node, period] = slots
         return self._slots[node, period]
-
-    @cached_property
-    def _slots(self) -> dict[tuple[int, float], dict[int, list[int]]]:
-        return {}
 
     def times(self, node: int, horizon: float) -> FloatArray:
         """Return the times (K,) in seconds, below the ``horizon``, of the rows of ``node``."""

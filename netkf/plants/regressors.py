@@ -36,10 +36,7 @@ class RegressorSensor(Sensor):
     xi_cov: FloatArray = field(covariance)
     R: FloatArray = field(definite_covariance)
 
-    @property
-    def varying(self) -> bool:
-        """True: H is drawn for every slot."""
-        return True
+    varying = True  # H is drawn for every slot
 
     @property
     def H(self) -> FloatArray:

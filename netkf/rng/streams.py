@@ -34,67 +34,36 @@ Generators = Callable[[str], np.random.Generator]
 
 @dataclass(frozen=True)
 class Streams:
-    """The source of every generator of one run.
+    """The source of every generator of one run, or of several ``runs`` of one seed: replicas
+    ``replica``, ``replica + 1``, ...
 
     ``seed`` and ``replica`` are non-negative integers; equal pairs give equal runs.
     """
 
     seed: int
     replica: int = 0
+    runs: int = 1
 
     def generator(self, purpose: str, *entity: int) -> np.random.Generator:
-        """Return the generator of ``purpose`` for ``entity``: non-negative integers, such as a node
-        id or the two ends of a link.
+        """Return the generator, in the first run, of ``purpose`` for ``entity``: non-negative
+        integers, such as a node id or the two ends of a link.
         """
         key, counter = _key_and_counter(self.seed, self.replica, _purpose_code(purpose), entity)
         bits = cast(Any, np.random.Philox)
         return np.random.Generator(bits(_Key(key), counter=counter))
 
     @property
-    def runs(self) -> int:
-        """Number of runs: 1; ``ReplicaStreams`` has several."""
-        return 1
-
-    @property
-    def per_replica(self) -> tuple[Streams, ...]:
-        """The streams of each run: these."""
-        return (self,)
-
-    def states(self, purpose: str, entities: Sequence[tuple[int, ...]]) -> np.ndarray:
-        """Return the states (K, WIDTH) at the start, of 64-bit words, of the streams of K
-        ``entities`` (ids of each) for ``purpose``, for kernels.
-        """
-        return ReplicaStreams(self.seed, self.replica, 1).states(purpose, entities)
-
-
-@dataclass(frozen=True)
-class ReplicaStreams:
-    """The streams of ``count`` runs of one seed: replicas ``replica``, ``replica + 1``, ...
-
-    They give the same numbers as the ``Streams`` of each run.
-    """
-
-    seed: int
-    replica: int
-    count: int
-
-    @property
-    def runs(self) -> int:
-        """Number of runs."""
-        return self.count
-
-    @property
     def per_replica(self) -> tuple[Streams, ...]:
         """The streams of each run."""
-        return tuple(Streams(self.seed, self.replica + k) for k in range(self.count))
+        return tuple(Streams(self.seed, self.replica + k) for k in range(self.runs))
 
     def states(self, purpose: str, entities: Sequence[tuple[int, ...]]) -> np.ndarray:
-        """Return the states (count K, WIDTH) at the start of the streams of K entities for
-        ``purpose``, run by run.
+        """Return the states (runs K, WIDTH) at the start, of 64-bit words, of the streams of K
+        ``entities`` (ids of each) for ``purpose``, run by run, for kernels.
         """
-        states = np.zeros((self.count, len(entities), WIDTH), dtype=np.uint64)
+        states = np.zeros((self.runs, len(entities), WIDTH), dtype=np.uint64)
         states[:, :, USED] = BLOCK_WORDS
-        code, replicas = _purpose_code(purpose), range(self.replica, self.replica + self.count)
+        code, replicas = _purpose_code(purpose), range(self.replica, self.replica + self.runs)
         ids = _ids_in_counter(tuple(entities)) if entities else None
         if ids is not None and replicas[-1] < WORD:
             states[:, :, KEY:BUFFER], states[:, :, 1:3] = _key(self.seed), ids

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from netkf.engines.compiled.sample_tables import KernelSamples, SampleTables, samples_of
-from netkf.rng.streams import ReplicaStreams, Streams
+from netkf.rng.streams import Streams
 
 CLOCKS = [
     {"kind": "poisson", "rate": 2.0},
@@ -42,7 +42,7 @@ def test_samples_of_several_windows(case):
 
 
 def test_samples_of_several_runs_are_those_of_each(case):
-    together = KernelSamples(case, ReplicaStreams(3, 2, 3))
+    together = KernelSamples(case, Streams(3, 2, 3))
     states = np.random.default_rng(1).standard_normal((len(together.t), 2))
     together.read_from(0, states)
     all_of, place = together.instants, 0

@@ -7,7 +7,7 @@ import pytest
 
 from netkf.engines.compiled import ticks as ticks_module
 from netkf.engines.compiled.ticks import LISTED, Schedule
-from netkf.rng.streams import ReplicaStreams, Streams
+from netkf.rng.streams import Streams
 
 CHANNELS = {
     "shared": {"symmetric": True, "loss": {"kind": "bernoulli", "delivery": 0.7}},
@@ -124,8 +124,8 @@ def test_all_clocks_and_channels(ring, monkeypatch, in_python, clock, channel):
     (_, made), (_, plain) = all_of(schedule), all_of(in_python(case, Streams(3)))
     assert len(made[0]) > 300
     assert_same(made, plain)
-    batch = Schedule(case, ReplicaStreams(2, 1, 2)).all()
-    listed = in_python(case, ReplicaStreams(2, 1, 2)).all()
+    batch = Schedule(case, Streams(2, 1, 2)).all()
+    listed = in_python(case, Streams(2, 1, 2)).all()
     for run in range(2):
         plain = all_of(in_python(case, Streams(2, 1 + run)))[1]
         assert_same(of_run(batch, run), plain)
@@ -153,9 +153,9 @@ def test_room_grows_where_there_are_more_ticks_than_expected(busy, in_python):
 @pytest.mark.parametrize("user", [(), ("draws_in_kernels",)])
 def test_several_runs_are_what_each_is_alone(busy, in_python, user):
     case = busy(CHANNELS["shared"])
-    few = in_python(case, ReplicaStreams(3, 5, 3), user)
+    few = in_python(case, Streams(3, 5, 3), user)
     few._rate *= 1e-3  # many more ticks than expected: the arrays grow
-    for schedules in (few, in_python(case, ReplicaStreams(3, 5, 3), user)):
+    for schedules in (few, in_python(case, Streams(3, 5, 3), user)):
         ticks = schedules.all()
         for run in range(3):
             plain = all_of(in_python(case, Streams(3, 5 + run)))[1]

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from netkf.rng.draws import fill_units, next_exponential, next_unit, ziggurat
-from netkf.rng.streams import ReplicaStreams, Streams
+from netkf.rng.streams import Streams
 
 LINKS = [(k, k + 1) for k in range(20)] + [(2**40, 3)]
 
 
-@pytest.mark.parametrize("streams", [Streams(3, 1), ReplicaStreams(2**70, 5, 3)])
+@pytest.mark.parametrize("streams", [Streams(3, 1), Streams(2**70, 5, 3)])
 def test_exponentials_and_units_are_those_of_numpy(streams):
     """Among 100,000 exponentials are some from every layer and from the tail of the ziggurat."""
     states = streams.states("clock", LINKS)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from netkf.rng.draws import philox
-from netkf.rng.streams import KEY, ReplicaStreams, Streams
+from netkf.rng.streams import KEY, Streams
 
 ONES = 2**64 - 1
 PI = (0x243F6A8885A308D3, 0x13198A2E03707344, 0xA4093822299F31D0, 0x082EFA98EC4E6C89)
@@ -57,7 +57,7 @@ def test_streams_are_numpys_with_this_counter(seed, replica):
 def test_states_of_kernels_are_those_of_generators():
     for entities in ([(0, 1), (7, 2**40)], [(3,)], [()], [(1, 2, 3), (2**64, 1)], []):
         for replica in (0, 2**32 - 2, 2**32):
-            together = ReplicaStreams(5, replica, 3).states("clock", entities)
+            together = Streams(5, replica, 3).states("clock", entities)
             names = itertools.product(range(replica, replica + 3), entities)
             for state, (run, entity) in zip(together, names, strict=True):
                 found = Streams(5, run).generator("clock", *entity).bit_generator.state["state"]

@@ -32,7 +32,7 @@ from netkf.plants.linear import LinearPlant, SlotPlant
 from netkf.plants.maps import NonlinearPlant
 from netkf.plants.nonlinear import NonlinearSensor
 from netkf.rng.normals import StreamNormals
-from netkf.rng.streams import ReplicaStreams, Streams
+from netkf.rng.streams import Streams
 from netkf.scenario.model import PlacedSensor, takes_samples
 from netkf.scenario.scenario import Scenario
 
@@ -142,7 +142,7 @@ def start_states(scenario: Scenario, seed: int, count: int) -> FloatArray:
     """Return x(0) (count, n) of the first ``count`` replicas, from their own streams."""
     # Built-in classes draw all replicas in one call, with the same numbers as one by one.
     if type(scenario.plant) in (LinearPlant, Diffusion, NonlinearPlant, NonlinearDiffusion):
-        states = ReplicaStreams(seed, 0, count).states("plant", [()])
+        states = Streams(seed, 0, count).states("plant", [()])
         return scenario.plant.starts(StreamNormals(states))
     starts = []
     for replica in range(count):

@@ -39,7 +39,7 @@ from netkf.network.node_clocks import NodeTime
 from netkf.plants.diffusion import NO_TIMES
 from netkf.plants.paths import BLOCK
 from netkf.plants.transitions import frame_period
-from netkf.rng.streams import ReplicaStreams, Streams
+from netkf.rng.streams import Streams
 from netkf.scenario.sampling import uses_grid
 from netkf.scenario.scenario import Scenario
 from netkf.trace.batch import COMPLETE, DIVERGED, RunBatch
@@ -249,7 +249,7 @@ class BatchDraws:
 
     def __init__(self, scenario: Scenario, seed: int, replicas: range) -> None:
         self.clocks: dict[int, NodeTime] = {}
-        streams = ReplicaStreams(seed, replicas.start, len(replicas))
+        streams = Streams(seed, replicas.start, len(replicas))
         self.ticks = Schedule(scenario, streams, is_immediate(scenario)).all()
         self._paths: Paths | None = None
         self.states: PathStates | KnownStates

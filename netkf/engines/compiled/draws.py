@@ -22,7 +22,7 @@ from netkf.plants.sensors import step_noise
 from netkf.rng.draws import Ziggurat
 from netkf.rng.normals import StreamNormals
 from netkf.rng.numbers import next_normal, normal_ziggurat
-from netkf.rng.streams import ReplicaStreams, Streams
+from netkf.rng.streams import Streams
 from netkf.scenario.model import PlacedSensor
 from netkf.scenario.scenario import Scenario
 
@@ -72,11 +72,7 @@ class Paths:
     """
 
     def __init__(
-        self,
-        scenario: Scenario,
-        streams: Streams | ReplicaStreams,
-        blocks: int,
-        sampled: FloatArray = NO_TIMES,
+        self, scenario: Scenario, streams: Streams, blocks: int, sampled: FloatArray = NO_TIMES
     ) -> None:
         self._blocks = blocks
         # Separate streams for the path, for the states at probes and for those at samples, so that
@@ -192,7 +188,7 @@ class Noise:
     sensing grid into ``sensing.noise``.
     """
 
-    def __init__(self, scenario: Scenario, streams: Streams | ReplicaStreams, steps: int) -> None:
+    def __init__(self, scenario: Scenario, streams: Streams, steps: int) -> None:
         shared, keys = _sensor_fields(scenario)
         self._noise = streams.states("noise", keys)
         # Without increment sensors the period is not used; it only must not be None.

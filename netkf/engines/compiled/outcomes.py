@@ -55,7 +55,7 @@ from netkf.network.radio import Airtime
 from netkf.network.scheduled import ScheduledLoss
 from netkf.rng.draws import Ziggurat, next_exponential, next_unit, ziggurat
 from netkf.rng.numbers import next_normal, normal_ziggurat
-from netkf.rng.streams import WIDTH, ReplicaStreams, Streams
+from netkf.rng.streams import WIDTH, Streams
 from netkf.scenario.model import Network
 from netkf.scenario.scenario import Scenario
 
@@ -225,7 +225,7 @@ def next_delay(channels: ChannelStreams, k: int) -> float:
 
 def list_outcomes(
     scenario: Scenario,
-    streams: Streams | ReplicaStreams,
+    streams: Streams,
     senders: Senders,
     ticks: Sequence[FloatArray],
     moving: MovingLinks | None = None,
@@ -382,7 +382,7 @@ def delay_is_zero(channel: Channel) -> bool:
 
 def channel_streams(
     channel: Channel,
-    streams: Streams | ReplicaStreams,
+    streams: Streams,
     senders: Senders,
     delivery: FloatArray,
     bits: bool = False,

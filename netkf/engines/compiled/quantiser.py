@@ -11,7 +11,7 @@ from netkf.linalg.generic import struct_like
 from netkf.linalg.structs import Struct
 from netkf.network.quantise import Quantisation, first_entries, quantise_number
 from netkf.rng.draws import next_unit
-from netkf.rng.streams import WIDTH, ReplicaStreams, Streams
+from netkf.rng.streams import WIDTH, Streams
 from netkf.scenario.scenario import Scenario
 
 
@@ -93,7 +93,7 @@ class PayloadQuantiser:
         self.struct.received = np.zeros(max(len(field.first) for field in fields))
 
 
-def dither_of(scenario: Scenario, streams: Streams | ReplicaStreams) -> np.ndarray | None:
+def dither_of(scenario: Scenario, streams: Streams) -> np.ndarray | None:
     """Return the streams (R N, WIDTH) of the dither of all nodes in R runs, None without any."""
     if scenario.network.quantise is None:
         return None

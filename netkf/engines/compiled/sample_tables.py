@@ -27,7 +27,7 @@ from netkf.plants.readings import read_many
 from netkf.plants.sensors import LinearSensor
 from netkf.rng.draws import Ziggurat, ziggurat
 from netkf.rng.numbers import next_normal, normal_ziggurat
-from netkf.rng.streams import ReplicaStreams, Streams
+from netkf.rng.streams import Streams
 from netkf.scenario.model import PlacedSensor
 from netkf.scenario.sampling import all_sample_times
 from netkf.scenario.scenario import Scenario
@@ -115,7 +115,7 @@ class KernelSamples:
     are number ``edges[r]`` to ``edges[r + 1]`` - 1 of all, taken at ``t`` (K,), seconds.
     """
 
-    def __init__(self, scenario: Scenario, streams: Streams | ReplicaStreams) -> None:
+    def __init__(self, scenario: Scenario, streams: Streams) -> None:
         sensors = kernel_sensors(scenario)
         assert sensors is not None
         self._tables, self._root = _sensor_tables(scenario), sensors.root
@@ -136,7 +136,7 @@ class KernelSamples:
     @staticmethod
     def _times(
         scenario: Scenario,
-        streams: Streams | ReplicaStreams,
+        streams: Streams,
         clock: LinkClock,
         own: list[tuple[int, int]],
         rates: FloatArray,

@@ -63,7 +63,7 @@ from netkf.plants.slot_paths import (
     draw_starts,
 )
 from netkf.rng.numbers import normal_ziggurat
-from netkf.rng.streams import ReplicaStreams, Streams
+from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.batch import COMPLETE, DIVERGED, RunBatch
 from netkf.trace.recorder import LONG, Recorder
@@ -122,14 +122,12 @@ class SlotRuns:
     samples of all slots, for the results of a batch.
     """
 
-    def __init__(
-        self, scenario: Scenario, streams: Streams | ReplicaStreams, store_all: bool = False
-    ) -> None:
+    def __init__(self, scenario: Scenario, streams: Streams, store_all: bool = False) -> None:
         self.setup: SlotSetup = slot_setup(scenario)
         self._scenario, self._streams = scenario, streams
         self._first = Streams(streams.seed, streams.replica)
         # One run, or the replicas of a batch.
-        self.runs = 1 if isinstance(streams, Streams) else streams.count
+        self.runs = streams.runs
         self._slot = 0
         setup, runs = self.setup, self.runs
         # A batch stores the samples of the whole runs, a single run those of a block at a time.
@@ -946,7 +944,7 @@ def slot_batch(
     """Simulate R consecutive ``replicas`` side by side. A run that diverges goes on to the end with
     invalid numbers, which ``with_ends`` replaces.
     """
-    runs = SlotRuns(scenario, ReplicaStreams(seed, replicas.start, len(replicas)), store_all=True)
+    runs = SlotRuns(scenario, Streams(seed, replicas.start, len(replicas)), store_all=True)
     assert runs.samples is not None
     # The hash that trace.recorder computes: the rows of the first run are hashed, not stored.
     events_hash = hashlib.sha256()

@@ -37,7 +37,7 @@ from netkf.network.clocks import LinkClock, Periodic, Poisson, RecordedClock, Re
 from netkf.network.losses import Transmission, law_in_kernels
 from netkf.rng.draws import Ziggurat, fill_units, next_exponential, next_unit, ziggurat
 from netkf.rng.numbers import next_gamma, normal_ziggurat
-from netkf.rng.streams import ReplicaStreams, Streams
+from netkf.rng.streams import Streams
 from netkf.scenario.positions import ticks_of
 from netkf.scenario.scenario import Scenario
 
@@ -344,7 +344,7 @@ def ticks_apart(clock: object) -> bool:
 
 def _list_ticks(
     scenario: Scenario,
-    streams: Streams | ReplicaStreams,
+    streams: Streams,
     senders: Senders,
     instants: Instants | None,
     lives: LifeTable,
@@ -383,7 +383,7 @@ def clocks_of(
     clock: object,
     entities: Sequence[tuple[int, ...]],
     rates: FloatArray,
-    streams: Streams | ReplicaStreams,
+    streams: Streams,
     purposes: tuple[str, str],
     per_second: float,
 ) -> Clocks:
@@ -484,7 +484,7 @@ class Schedule:
     def __init__(
         self,
         scenario: Scenario,
-        streams: Streams | ReplicaStreams,
+        streams: Streams,
         bits: bool = False,
         instants: Instants | None = None,
         truth: Any = None,
