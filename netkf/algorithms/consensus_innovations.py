@@ -64,28 +64,16 @@ class ConsensusGains(NamedTuple):
     root: FloatArray
 
 
-class PseudoStates(NamedTuple):
-    """Matrices (n, n) of the pseudo-state ``G x``.
-
-    G : information of all sensors together
-    inverse : a pseudo-inverse G^+, that of least norm in units in which the diagonal of G is 1
-    """
-
-    G: FloatArray
-    inverse: FloatArray
-
-
-def pseudo_states(information: FloatArray) -> PseudoStates:
-    """Return the matrices (n, n) of the pseudo-state ``G x``: G = ``information`` (n, n), that of
-    all sensors, and a pseudo-inverse.
+def pseudo_inverse(information: FloatArray) -> FloatArray:
+    """Return a pseudo-inverse of G = ``information`` (n, n), that of all sensors, of pseudo-states
+    ``G x``: the one of least norm in units in which the diagonal of G is 1.
     """
     # Sensors may leave directions unobserved: G is singular then, and G^+ G projects on the others.
     # Which ones must not depend on the units of states; any generalised inverse serves.
     sizes = np.diagonal(information)
     units = np.sqrt(np.where(sizes > UNSEEN * sizes.max(), sizes, 1.0))
     units = units[:, None] * units
-    inverse = np.linalg.pinv(information / units, hermitian=True) / units
-    return PseudoStates(information, np.asarray(inverse))
+    return np.asarray(np.linalg.pinv(information / units, hermitian=True) / units)
 
 
 class GainSequence:
@@ -113,12 +101,13 @@ class GainSequence:
         self._F, self._changes = F, changes
         self._n, self._neighbours, self._information = len(cov), heard, information
         n, N = self._n, len(heard)
-        self._pseudo = pseudo_states(self._information.sum(axis=0))
+        self._G = information.sum(axis=0)
+        self._inverse = pseudo_inverse(self._G)
         # Columns of zeros, as of nodes without a sensor, add no noise: leave them out.
         roots = map(square_root, self._information)
         self._noises = [root[:, root.any(axis=0)] for root in roots]
         # x and w enter all errors of xhat by I, and all errors of yhat by G: (2 N n, n).
-        stacked = np.concatenate([np.tile(np.eye(n), (N, 1)), np.tile(self._pseudo.G, (N, 1))])
+        stacked = np.concatenate([np.tile(np.eye(n), (N, 1)), np.tile(self._G, (N, 1))])
         # All nodes start from the same mean: only x(0) - mean makes errors, as does w later.
         self._errors = stacked @ square_root(cov)
         self._driven = [stacked @ square_root(one) for one in Q]
@@ -168,7 +157,7 @@ class GainSequence:
         x, y = self._errors.reshape(2, len(nodes), self._n, -1)
         # Slot number k is predicted from k - 1 on.
         piece = bisect.bisect_right(self._changes, len(self._gains))
-        F, (G, inverse) = self._F[piece], self._pseudo
+        F, G, inverse = self._F[piece], self._G, self._inverse
         predicted = np.stack([F @ x, G @ (F @ (inverse @ y + x - inverse @ (G @ x)))])
         self._errors = np.hstack([predicted.reshape(self._errors.shape), self._driven[piece]])
         # The order of the filter: yhat from the exchange, then xhat from the new yhat.
@@ -195,7 +184,7 @@ class GainSequence:
         gains, corrected = [], []
         for i, neighbours in enumerate(self._neighbours):
             e = self._pseudo_error(i)
-            observed = self._information[i] @ self._pseudo.inverse
+            observed = self._information[i] @ self._inverse
             innovation = observed @ e
             # Its noise H' R^-1 v has the covariance H' R^-1 H, in inputs (columns) of its own.
             stop = first + self._noises[i].shape[1]
@@ -216,7 +205,7 @@ class GainSequence:
 
     def _correct_state(self, i: int) -> FloatArray:
         """Correct the error of xhat of node ``i``, and return the gain K (n, n)."""
-        G, e, e_y = self._pseudo.G, self._state_error(i), self._pseudo_error(i)
+        G, e, e_y = self._G, self._state_error(i), self._pseudo_error(i)
         theta = G @ e - e_y
         K = optimal_gain(e, theta, np.square(G) @ variances(e) + variances(e_y))
         e -= K @ theta
@@ -351,13 +340,14 @@ def consensus_innovations_record(
     network = infos[0].network
     assert network is not None
     n, H = len(models[0].information), len(infos)
-    pseudo = pseudo_states(network.information.sum(axis=0))
+    G = network.information.sum(axis=0)
     pieces = getattr(models[0], "pieces", models[:1])
     return Record(
         node={"pseudo": (n,), "start": (n, n)},
         payload={"pseudo": (n,)},
         settings={
-            **{name: np.array(part, order="C") for name, part in pseudo._asdict().items()},
+            "G": G,
+            "inverse": np.ascontiguousarray(pseudo_inverse(G)),
             "B": np.zeros((1, 1, n, n)),
             **{name: np.zeros((1, H, n, n)) for name in ("M", "K", "roots")},
             "F": np.array([piece.F for piece in pieces]),
