@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from netkf.checks.laws import find_largest
 from netkf.checks.mode_sequences import sensing_neighbours
 from netkf.checks.report import verdict_text
 from netkf.checks.samples import ReplicaSummary
+from netkf.checks.stochastic_trigger import check_rate
 from netkf.laws.intervals import Interval
 from netkf.laws.losses import mean_correlation
 from netkf.laws.ticks import largest_correlation
@@ -103,6 +105,21 @@ def test_one_mistake_is_one_broken_row():
         assert rows[k].verdict == NOT_PROMISED
         assert f'follows from the broken row "{root}"' in rows[k].assumptions
         assert rows[k].seen == 2.0
+
+
+@pytest.mark.parametrize("parts", [(), ("plant",)])
+def test_a_class_departs_by_itself_where_rows_of_its_filter_follow_from_parts(parts):
+    off = Finding((-2.0, -3.0, -1.0), 0.1, "")
+    rows = [promise("same", off, group=evidence.BASE), promise("e", off, group=evidence.ERRORS)]
+    rows += [promise(name, off, group=name) for name in parts]
+    assert broken(fold_followers(judge(rows, None, [], 20, 0.01))) == (
+        ["same", "plant"] if parts else ["e"]
+    )
+
+
+def test_rates_of_nodes_that_decide_nothing_are_unknown():
+    found = check_rate(SimpleNamespace(runs=SimpleNamespace(sends=np.zeros((20, 2)))), 0.01)
+    assert "no node has a slot" in found.message
 
 
 def test_a_verdict_fits_on_two_screens_unless_all_is_asked_for():

@@ -71,6 +71,7 @@ class Increments(LinearSensor):
 
 ONE = {"H": [[1.0, 0.0, 0.0, 0.0]], "R": [[0.5]]}
 TWO = {"H": np.eye(2, 4), "R": [[0.5, 0.2], [0.2, 0.3]]}
+INPUT = {"kind": "constant", "G": np.eye(4, 1).tolist(), "value": [0.7]}
 IN_SLOTS = {
     "laplace": LaplaceSensor(nodes=(0, 2), **TWO),
     "from the contract": Bearing(nodes=(1, 3), direction=[3.0, 4.0, 0.0, 0.0], sigma=0.5),
@@ -98,7 +99,9 @@ def in_clocks(scenario, cls):
 @pytest.mark.parametrize("kind", IN_SLOTS)
 def test_in_slots(slots, kind):
     built_in = LinearSensor(nodes=(1,), H=[[0.0, 1.0, 0.0, 0.0]], R=[[2.0]])
-    scenario = slots.replace({"sensors": [IN_SLOTS[kind], built_in]})
+    # Beside an input states are counted from the response to it.
+    driven = {"plant.input": INPUT} if kind == "turning" else {}
+    scenario = slots.replace({"sensors": [IN_SLOTS[kind], built_in], **driven})
     run = assert_agree(scenario)
     assert netkf.simulate(scenario).engine == "compiled"
     # Runs side by side are what they are alone.

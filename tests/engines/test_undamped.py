@@ -10,12 +10,22 @@ import pytest
 import scipy.linalg
 
 import netkf
+from netkf.algorithms.modes import rate_groups
 from netkf.scenario.reading import from_table
 from tests.engines.agreement import assert_agree
 
 
 def chain(n):
     return np.diag(np.ones(n - 1), 1) if n > 1 else np.zeros((1, 1))
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_rates_of_modes_that_do_not_decay_are_0_in_any_unit_of_time(unit):
+    axes = np.linalg.qr(np.random.default_rng(1).standard_normal((3, 3)))[0]
+    A = scipy.linalg.block_diag([[0.0, 1.0], [-1.0, 0.0]], [[-1.0]])
+    rates = rate_groups(unit * axes @ A @ axes.T).rates
+    assert rates.min() == 0.0
+    assert rates.max() == pytest.approx(unit, rel=1e-9)
 
 
 def clocked(A, B, H, kind="local"):

@@ -270,6 +270,10 @@ def test_nodes_send_as_often_as_the_matrices_of_their_slots_say():
     )
     difference = sent - expected  # a martingale
     assert abs(difference.mean()) < 4.0 * difference.std() / np.sqrt(60)
+    # Readings that weigh so much are sent for certain.
+    certain = s.replace({"filter.Y": [[1e12]]})
+    sent, expected = expected_sends(certain, netkf.simulate(certain, engine="simpy"))
+    assert expected == pytest.approx(sent, rel=1e-3)
     run = netkf.simulate(s, engine="simpy")
     np.testing.assert_allclose(netkf.theory.error_covariance(s, run), run.P, rtol=1e-9)
 
