@@ -425,6 +425,29 @@ def test_curves_over_many_orders_of_magnitude_are_drawn(look, build, tmp_path):
     assert page.evaluate(blue) > 0.6 * lived > 0.1
 
 
+def test_ticks_of_a_map_and_of_a_short_run_differ(look, tmp_path):
+    """Eastings and northings, and microseconds."""
+    changes = {"plants.0.mean": [4.6e5, 5.5e6]}
+    changes |= {f"plants.{k}.mean": [4.6e5 + k, 5.5e6] for k in range(1, 5)}
+    places = SCENARIOS / "blocks" / "formation.toml", changes | {"horizon": 3.0}
+    brief = SCENARIOS / "poisson_ring.toml", {"horizon": 5e-5, "probe": 1e-6}
+    for (file, given), wanted in ((places, "5500000"), (brief, "1e-5")):
+        out = tmp_path / file.stem
+        directory = run_to_directory(netkf.load(file, given), out).directory
+        page = look(write_report([directory], out / "page.html"))
+        page.evaluate("""() => {
+          const type = CanvasRenderingContext2D.prototype, fill = type.fillText;
+          window.drawn = [];
+          type.fillText = function (text, ...rest) {
+            window.drawn.push(String(text));
+            fill.call(this, text, ...rest);
+          };
+        }""")
+        page.select_option("#node", "1")
+        page.wait_for_function(f"window.drawn.includes('{wanted}')")
+        assert "5.5e+6" not in page.evaluate("window.drawn")
+
+
 def test_nodes_are_shown_by_their_names(look, tmp_path):
     names = ["zero", "<b>one</b>", 'two, "2"']
     graph = nx.relabel_nodes(nx.path_graph(3), dict(enumerate(names)))
@@ -433,6 +456,7 @@ def test_nodes_are_shown_by_their_names(look, tmp_path):
     directory = run_to_directory(scenario, tmp_path / "run").directory
     page = look(write_report([directory], tmp_path / "page.html"))
     page.click("text=All nodes at this time as a table")
+    page.wait_for_selector("#table tbody th")
     assert page.locator("#table tbody th").all_text_contents() == names
     page.select_option("#node", "2")
     page.wait_for_function(

@@ -31,7 +31,7 @@ const Curves = (() => {
         // A stretch of time that is dragged over is what all figures over time then show.
         cursor: { drag: { x: Boolean(timed), y: false, setScale: false, dist: 6 }, y: false },
         scales: { x: { time: false, ...(timed ? { range: (u, low, high) => app.span || (app.runs.length ? [0, app.end] : [low, high > low ? high : low + 1]) } : {}), ...(xlabel === "node" ? { range: (u, low, high) => [low - 0.5, high + 0.5] } : {}) }, y: { range: (u, low, high) => yRange(low, high, lines, band, steep) } },
-        axes: [{ ...axis, label: xlabel || "time (s)", labelSize: 22, size: 34,
+        axes: [{ ...axis, label: xlabel || "time (s)", labelSize: 22, size: 34, values: (u, splits) => splits.map((v) => short(v, 10)),
           ...(WHOLE.includes(xlabel) ? { values: (u, splits) => splits.map((v) => (Number.isInteger(v) ? Format.brief(names && names.has(v) ? names.get(v) : v, 10) : "")) } : {}) }, { ...axis, label: unit, labelFont: Math.min(12, 360 / unit.length) + "px system-ui, sans-serif", labelSize: 20, size: 58, values: (u, splits) => splits.map(steep ? powerOfTen : tick) }],
         series: [{}, ...expanded(series)],
         bands: bandsOf(series),
@@ -47,7 +47,13 @@ const Curves = (() => {
 
   function tick(value) {
     if (!Number.isFinite(value)) return "";
-    return Math.abs(value) >= 1e5 ? Format.number(value) : String(Number(value.toPrecision(6)));
+    return Math.abs(value) >= 1e5 ? Format.number(value) : short(value, 6);
+  }
+
+  // Small numbers with an exponent, which has room beside the label of an axis.
+  function short(value, digits) {
+    const rounded = Number(value.toPrecision(digits));
+    return rounded !== 0 && Math.abs(rounded) < 1e-3 ? rounded.toExponential() : String(rounded);
   }
 
   function powerOfTen(value) {

@@ -208,7 +208,10 @@ const Estimates = (() => {
 
   function tickText(value, [low, high]) {
     const digits = Math.max(0, Math.min(12, 1 - Math.floor(Math.log10((high - low) / 5))));
-    return Math.abs(value) >= 1e5 || high - low < 1e-6 ? value.toExponential(1) : String(Number(value.toFixed(digits)));
+    // Two digits tell large numbers apart that begin near 0, and not those of a map.
+    const largest = Math.max(Math.abs(low), Math.abs(high)), far = largest / (high - low);
+    const short = Math.abs(value) >= 1e5 && (far < 4 || far > 1e8);
+    return short || high - low < 1e-6 ? value.toExponential(1) : String(Number(value.toFixed(digits)));
   }
 
   return { view, glyph, ticks };
