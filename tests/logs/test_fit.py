@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -18,6 +19,7 @@ from netkf.logs.fitting import run_tests
 from netkf.logs.outcomes import (
     Group,
     LogOutcomes,
+    _shrinkage,
     binomial_interval,
     choose_windows,
     correlation_time,
@@ -269,6 +271,17 @@ def test_the_chain_of_two_states():
         law = law @ move * (np.array([good, bad]) if x else 1.0 - np.array([good, bad]))
         total, law = total + math.log(law.sum()), law / law.sum()
     assert chain.likelihood == pytest.approx(total, abs=1e-9)
+
+
+def test_the_spread_of_deliveries_that_is_noise_is_that_of_what_hearers_lose_alone():
+    p, n = np.array([0.2, 0.5, 0.8]), 100
+    noise = np.mean(p * (1.0 - p) / n)
+    fate, alone = np.ones((3, 3)), np.eye(3)
+    pair = np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])  # two of three hearers have one fate
+    for residuals, share in ((fate, 0.0), (alone, 1.0), (pair, 2.0 / 3.0)):
+        group = SimpleNamespace(mean=p, x=np.ones((n, 3)), residuals=residuals)
+        found = _shrinkage(SimpleNamespace(groups=[group]))
+        assert found == pytest.approx(1.0 - share * noise / p.var(ddof=1), abs=1e-12)
 
 
 def test_the_logistic_function_of_the_distance():

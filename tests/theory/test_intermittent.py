@@ -242,8 +242,9 @@ def test_quantiles_of_the_scalar_law(level):
         assert min(sides) * (1 - 1e-9) <= got <= max(sides) * (1 + 1e-9), row
 
 
-def test_samples_and_exact_law_agree():
+def test_samples_and_exact_law_agree(monkeypatch):
     """Kolmogorov-Smirnov at level 1e-4; a law of the wrong delivery is told apart."""
+    monkeypatch.setattr("netkf.theory.intermittent.riccati.MAX_SAMPLES_AT_ONCE", 3000)
     scipy_stats = pytest.importorskip("scipy.stats")
     P = theory.invariant_samples(*SCALAR, delivery=0.75, samples=4000, seed=8)[:, 0, 0]
     P = np.round(P, 9)
