@@ -188,23 +188,46 @@ def test_refusals_do_not_wait_for_matplotlib(tmp_path):
         *(["report", "run", "--out", "b.png"], ["report", "run", "--out", "run"]),
         *(["report", "run", "run", "run"], ["report", "run", "--replica", "x"]),
     ]
+    assert modules_after(refused, tmp_path) & {"matplotlib"} == set()
+
+
+def test_what_is_refused_at_once_does_not_wait_for_imports(tmp_path):
+    wrong = [RING, "--set", "filter.epsilno=0.3"]
+    refused = [
+        *([name, *wrong] for name in ("check", "theory", "consistency", "innovations")),
+        *(["plan", *wrong, "--runs", "2"], ["sweep", *wrong, "--vary", "seed=1,2"]),
+        ["size", *wrong, "--vary", "network.activation.rate=1:2", "--target", "error<=1"],
+        ["compare-filters", *wrong, "--filters", "hybrid", "--runs", "2"],
+        *([name, "absent"] for name in ("why", "compare", "report", "fit", "work", "merge")),
+        ["export", "absent", "--to", "log"],
+    ]
+    assert (
+        modules_after(refused, tmp_path) & {"scipy.linalg", "pandas", "pyarrow", "matplotlib"}
+        == set()
+    )
+
+
+def modules_after(refused, folder):
+    """Names of the modules after commands that are refused, in one line each."""
     code = (
         "import sys\nfrom netkf.cli.main import main\n"
         f"for arguments in {refused}:\n"
         "    try:\n        print(main(arguments))\n"
         "    except SystemExit as end:\n        print(end.code)\n"
-        "print([name for name in sys.modules if name.startswith('matplotlib')])"
+        "print(*sys.modules)"
     )
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", code],
         check=False,
-        cwd=tmp_path,
+        cwd=folder,
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, sys.path)])},
         capture_output=True,
         text=True,
     )
-    assert done.stdout.split("\n") == ["2"] * len(refused) + ["[]", ""]
+    *statuses, modules = done.stdout.splitlines()
+    assert statuses == ["2"] * len(refused)
     assert len(done.stderr.splitlines()) == len(refused)
+    return set(modules.split())
 
 
 @pytest.mark.parametrize(
@@ -214,7 +237,7 @@ def test_refusals_do_not_wait_for_matplotlib(tmp_path):
         (["sweep", RING, "--vary", "seed=1,2", "--tasks", "3"], "--tasks: means nothing without"),
         (["plan", RING, "--runs", "2", "--time", "1h"], "--time: means nothing without --slurm"),
         (["check", RING, "--most", "50"], "--most: means nothing without --until"),
-        (["plot", "run", "--format", "svg", "--out", "a.png"], "--format: is not that of a.png"),
+        (["plot", ".", "--format", "svg", "--out", "a.png"], "--format: is not that of a.png"),
         (["import", ".", "--kind", "mrclam", "--hole", "5", "--out", "x"], "are of packet logs"),
         (
             ["size", RING, "--out", "x"],

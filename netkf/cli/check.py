@@ -21,9 +21,7 @@ from netkf.scenario.usage import unused_notes
 
 
 def _run(options: argparse.Namespace) -> int:
-    # Promises are checked at other times than those of ``probe``, which therefore need not fit the
-    # horizon; ``--set`` may have changed it.
-    scenario = load_scenario(options, {"probe": [0.0]})
+    scenario = load_scenario(options)
     if options.runs is None:
         options.runs = usual_runs(scenario)
         if options.runs < USUAL_RUNS:

@@ -5,15 +5,18 @@ from __future__ import annotations
 import argparse
 import os
 import re
+from collections.abc import Mapping
 from contextlib import nullcontext
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple, NoReturn
 
-from netkf.cli.options import MARGIN
+from netkf.cli.options import MARGIN, load_scenario
+from netkf.cli.progress import ProgressLine
 from netkf.core.errors import ScenarioError, quote
-from netkf.core.printable import MAX_NAME, MAX_RUNS
+from netkf.core.printable import MAX_NAME, MAX_RUNS, shorten
 from netkf.figures.names import FIGURE_NAMES, FIT_FIGURES, FORMATS
 
 ENGINES = ("auto", "simpy", "processes", "compiled")
@@ -43,13 +46,15 @@ class Command(NamedTuple):
 
     The module of this package with its name has ``_run``, which runs it with the parsed options and
     returns the exit status, or that of SHARED has ``run_NAME``. Unless it ``takes_scenario``, there
-    are no scenario file, ``--set`` and ``--trust``.
+    are no scenario file, ``--set`` and ``--trust``. ``unused`` are values for keys of the scenario
+    that the command does not use, and that may be wrong in the file.
     """
 
     name: str
     help: str
     options: tuple[Option | tuple[Option, ...], ...]
     takes_scenario: bool = True
+    unused: Mapping[str, Any] = MappingProxyType({})
 
     def add_to(self, commands: Any) -> None:
         """Add the parser of the command to ``commands``; namespaces have its function ``run``."""
@@ -78,7 +83,15 @@ class Command(NamedTuple):
         return self._run(options)
 
     def _run(self, options: argparse.Namespace) -> int:
-        # Only now, so that ``netkf --help`` and usage errors do not wait for numpy and numba.
+        # Only now, so that ``netkf --help`` and usage errors do not wait for numpy and numba; and
+        # before the imports of the command, for which what is refused at once need not wait.
+        for path in (*getattr(options, "directories", ()), getattr(options, "directory", ".")):
+            if not os.path.exists(path):
+                rule, remedy = "cannot be opened: it does not exist", "check the path"
+                raise ScenarioError(shorten(path), rule, None, remedy)
+        if self.takes_scenario and self.name != "run":  # which has other things to begin first
+            with ProgressLine():
+                load_scenario(options, self.unused)
         name = self.name.replace("-", "_")
         file = next((module for module, names in SHARED.items() if name in names.split()), name)
         module: Any = import_module(f"netkf.cli.{file}")
@@ -87,8 +100,6 @@ class Command(NamedTuple):
             from netkf.cli.planned import plan_study
 
             return plan_study(run, options)
-        from netkf.cli.progress import ProgressLine
-
         status: int
         with nullcontext() if hasattr(module, "ProgressLine") else ProgressLine():
             status = run(options)
@@ -340,6 +351,8 @@ COMMANDS = (
             *PLAN,
             NO_PLOT,
         ),
+        # Promises are checked at other times, so that probes need not fit the horizon.
+        unused={"probe": [0.0]},
     ),
     Command("theory", "check assumptions and compute bounds and limits; no simulation", (JSON,)),
     Command(

@@ -68,9 +68,12 @@ def load_scenario(
     options: argparse.Namespace, ignored: Mapping[str, Any] = MappingProxyType({})
 ) -> Scenario:
     """Return the scenario of the command line with ``--set`` and ``--seed``; ``ignored`` values
-    replace those of keys that the command does not use. Raises ScenarioError.
+    replace those of keys that the command does not use. It is read once. Raises ScenarioError.
     """
     copy: Path | None = getattr(options, "copy", None)
+    if copy is None and hasattr(options, "loaded"):
+        known: Scenario = options.loaded
+        return known
     path = options.scenario if copy is None else copy
     try:
         os.stat(path)  # before the imports of a scenario, which take longer
