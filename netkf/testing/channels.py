@@ -365,7 +365,7 @@ def _check_draws(watched: WatchedPart) -> None:
         random, other_random = (Streams(6, k).generator("delay") for k in range(2))
         delays = np.array([part.draw(random) for _ in range(DELAYS)])
         others = np.array([part.draw(other_random) for _ in range(DRAWS)])
-    if delays.std() <= 1e-9 * (1.0 + np.abs(delays).max()):
+    if delays.std() <= 1e-9 * np.abs(delays).max():
         return
     is_same, got = np.array_equal(delays[:DRAWS], others), "equal delays from two generators"
     watched.demand("draw", not is_same, OTHER_GENERATOR, got)
