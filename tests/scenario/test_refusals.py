@@ -937,7 +937,7 @@ USAGE = [
     ("long", ["why", "x", "--node", "9" * 5000], " ... "),
     ("dots", ["theory", "{file}", "--set", f"filter={{a{'.b' * 49_000} = 1}}"], "not valid TOML"),
     ("long-set", ["theory", "{file}", "--set", f"probe={'1' * 100_000}"], "at most 100,000 char"),
-    ("why-half", ["why", "x", "--node", "3"], "takes --node and --at together"),
+    ("why-half", ["why", ".", "--node", "3"], "takes --node and --at together"),
     ("set-nothing", ["run", "{file}", "--set"], "--set"),
     ("theory-out", ["theory", "{file}", "--out", "x"], "--out"),
 ]

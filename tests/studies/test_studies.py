@@ -166,7 +166,7 @@ def test_grids_are_lists_ranges_tables_and_words():
             ["size", RING, "--vary", f"{RATE}=1:2", "--target", "mean_rms<=1", "--confidence", "2"],
             "--confidence: must be a finite number",
         ),
-        (["compare", "nowhere"], "nowhere: is not a directory"),
+        (["compare", "nowhere"], "nowhere: cannot be opened: it does not exist"),
         (["compare", str(SCENARIOS)], "is not the directory of a run"),
     ],
 )

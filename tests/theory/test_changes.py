@@ -288,7 +288,7 @@ def test_bits_lower_p_by_the_matrices_of_their_slots():
 @pytest.mark.one_in(2)
 @pytest.mark.parametrize("aware", [True, False])
 def test_check_follows_the_changes(aware):
-    verdict = netkf.check(slots("diffusion", filter={} if aware else UNAWARE), runs=20)
+    verdict = netkf.check(slots("diffusion", filter={} if aware else UNAWARE), runs=20, seed=2)
     rows = verdict.table.set_index("promise")
     assert verdict, rows
     bound = rows.loc["P is at least the covariance of the error, given the events", "verdict"]
