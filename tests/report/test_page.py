@@ -775,7 +775,7 @@ def test_sweeps_are_not_compared(ring, sweep):
             "compare-filters",
             '--runs 2 --filters \'gossip,{ kind = "hcmci", steps = 2, consensus = "information" },'
             '{ kind = "event-triggered", inner = { kind = "kcf", epsilon = 0.1 }, '
-            "thresholds = [0.1, 0.2] }'",
+            'trigger = "consensus", thresholds = [0.1, 0.2] }\'',
         ),
     ],
 )
