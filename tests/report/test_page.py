@@ -774,8 +774,8 @@ def test_sweeps_are_not_compared(ring, sweep):
         (
             "compare-filters",
             '--runs 2 --filters \'gossip,{ kind = "hcmci", steps = 2, consensus = "information" },'
-            '{ kind = "event-triggered", inner = { kind = "kcf", epsilon = 0.1 }, '
-            'trigger = "consensus", thresholds = [0.1, 0.2] }\'',
+            '{ kind = "event-triggered", trigger = "consensus", thresholds = [0.1, 0.2], '
+            'inner = { kind = "hcmci", consensus = "information" } }\'',
         ),
     ],
 )
