@@ -10,7 +10,6 @@ from typing import Any
 from netkf import export_graphml, export_netcdf, export_perfetto
 from netkf.core.errors import ScenarioError
 from netkf.ensembles.monte_carlo import Ensemble
-from netkf.logs.exporting import export_log, export_recorded
 from netkf.studies.opening import open as open_directory
 from netkf.trace.run import Run
 
@@ -45,6 +44,8 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _write_folder(run: Any, options: argparse.Namespace) -> int:
+    from netkf.logs.exporting import export_log, export_recorded  # files of one run need none
+
     recorded = options.to == "recorded"
     *files, last = (export_recorded if recorded else export_log)(run, options.out)
     print(f"written: {last} with {', '.join(path.name for path in files)}")

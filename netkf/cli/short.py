@@ -69,11 +69,10 @@ def run_schema(options: argparse.Namespace) -> int:
 
 def run_theory(options: argparse.Namespace) -> int:
     """``netkf theory``: assumptions, bounds and limits of a scenario, without a simulation."""
-    scenario = load_scenario(options)
-    # These imports take half a second, which an invalid scenario need not wait for.
     from netkf.runs.failures import explain_failures
     from netkf.theory.promises import compute_promises, promises_text
 
+    scenario = load_scenario(options)
     with explain_failures(scenario):
         promises = compute_promises(scenario)
     print_notes(scenario.notes)

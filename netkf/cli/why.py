@@ -8,7 +8,6 @@ from pathlib import Path
 from netkf.cli.options import print_json, print_notes
 from netkf.core.errors import ScenarioError
 from netkf.core.printable import shorten
-from netkf.report.directories import read_source
 from netkf.runs.files import lock_directory, write_json, write_text
 from netkf.studies.why import why
 from netkf.trace.run import Run
@@ -55,6 +54,8 @@ def _explain(options: argparse.Namespace) -> int:
 
 def _find_worst_sample(options: argparse.Namespace) -> tuple[Run, int, float, str]:
     """Return run, node and time (s) of the worst sample after the start-up, and a note on it."""
+    from netkf.report.directories import read_source  # for which a named sample need not wait
+
     source = read_source(options.directory, options.replica, options.trust)
     samples = source.worst
     if samples is None or source.run is None:

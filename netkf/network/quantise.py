@@ -105,7 +105,7 @@ class Encoder:
         if isinstance(payload, np.ndarray):
             if not np.issubdtype(payload.dtype, np.floating):
                 return payload, 0
-            return self._encode_array(payload.astype(np.float64))
+            return self._encode_array(payload.astype(np.float64, copy=False))
         if hasattr(payload, "fields"):
             # Messages of kernels: rows of single payloads, with an axis of lanes behind.
             numbers = payload.sender.run.numbers
