@@ -32,6 +32,7 @@ from netkf.algorithms.models import (
     MapModel,
     RateModel,
     first_root,
+    lower,
     whiten_reading,
 )
 from netkf.algorithms.python_pairs import NOTHING_KEPT, Kept, PythonPairs
@@ -114,7 +115,7 @@ class Payload:
 
     def _replace(self, **fields: Any) -> Payload:
         """Return a payload with other values of some fields, as of a NamedTuple."""
-        arrays = {name: np.asarray(value)[None, ..., None] for name, value in fields.items()}
+        arrays = {name: _as_read(name, value)[None, ..., None] for name, value in fields.items()}
         return Payload({**self.fields, **arrays}, self.reading, self.sender)
 
 
@@ -162,7 +163,7 @@ class NodeState:
         """Return a state with other values of some fields, as of a NamedTuple."""
         new = self.copied()
         for name, value in fields.items():
-            getattr(new, name)[...] = value
+            getattr(new, name)[...] = _as_read(name, value)
         return new
 
     def copied(self, events: int = 0) -> NodeState:
@@ -517,4 +518,10 @@ def _field(payload: Any, name: str, receiver: int) -> np.ndarray:
     if isinstance(payload, Payload):
         k = payload.number_to(receiver)
         return payload.fields[name][k : k + 1]
-    return np.asarray(getattr(payload, name), dtype=np.float64)[None, ..., None]
+    value = np.asarray(getattr(payload, name), dtype=np.float64)
+    return _as_read(name, value)[None, ..., None]
+
+
+def _as_read(name: str, value: Any) -> np.ndarray:
+    """Return the ``value`` of a field that Python has set, as kernels read it."""
+    return lower(np.asarray(value)) if name == "root" else np.asarray(value)
