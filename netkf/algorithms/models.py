@@ -93,7 +93,7 @@ class FlowModel:
         ``xhat`` (n,) and ``root`` (n, n); the root counts the increments of the gap, the estimate
         not yet (``gain_update``).
         """
-        root, xhat = flow_root(self.flow, lower(root), xhat, gap)
+        root, xhat = flow_root(self.flow, lower(root), as_floats(xhat), gap)
         return xhat, root
 
     def extrapolate(
@@ -104,7 +104,7 @@ class FlowModel:
         """
         if age <= 0.0:
             return xhat, root
-        root, xhat = flow_root(self.unobserved_flow, lower(root), xhat, age)
+        root, xhat = flow_root(self.unobserved_flow, lower(root), as_floats(xhat), age)
         return xhat, root
 
     def transition(self, xhat: FloatArray, gap: float) -> FloatArray:
@@ -123,7 +123,7 @@ class FlowModel:
         ``moments`` (2 p,) are ``int dy`` and then ``int (2 (s - a) / gap - 1) dy`` over the gap,
         which begins at time a.
         """
-        return gain_update_root(self.gains, lower(root), xhat, moments, gap)
+        return gain_update_root(self.gains, lower(root), as_floats(xhat), moments, gap)
 
     def max_interval(self, root: FloatArray) -> float:
         """Return the longest measurement interval, in seconds, for a covariance with this root
@@ -266,7 +266,7 @@ class MapModel(SlotModel):
     ) -> tuple[FloatArray, FloatArray]:
         """Return the estimate and the root of its covariance, see ``SlotModel.predict``."""
         n = len(xhat)
-        x, S = np.array(xhat).reshape(1, n, 1), np.array(lower(root)).reshape(1, n, n, 1)
+        x, S = np.array(xhat, float).reshape(1, n, 1), np.array(lower(root)).reshape(1, n, n, 1)
         tables = self.tables()
         scratch = np.empty((n, n, 1)), np.empty((n, n, 1))
         for k in range(round(gap / self.period)):
@@ -446,7 +446,7 @@ class RateModel(FlowModel):
     ) -> tuple[FloatArray, FloatArray]:
         """Return the estimate and the root of its covariance, see ``FlowModel.predict``."""
         n = len(xhat)
-        x, S = np.array(xhat).reshape(1, n, 1), np.array(lower(root)).reshape(1, n, n, 1)
+        x, S = np.array(xhat, float).reshape(1, n, 1), np.array(lower(root)).reshape(1, n, n, 1)
         move_by_rate(self._rate_tables, x, S, 0, self.now, gap)
         self.raise_error()
         return x.reshape(n), S.reshape(n, n)
@@ -474,7 +474,13 @@ def lower(root: FloatArray) -> FloatArray:
     """Return a lower triangular root (n, n) of ``root root'``, as kernels read it: a user's class
     may have made another one, such as the symmetric one.
     """
-    return lower_root(root) if np.triu(root, 1).any() else root
+    S = as_floats(root)
+    return lower_root(S) if np.triu(S, 1).any() else S
+
+
+def as_floats(values: Any) -> FloatArray:
+    """Return an array as kernels read it, of a user's values: float32 or integers are others."""
+    return np.ascontiguousarray(values, dtype=np.float64)
 
 
 def first_root(cov: FloatArray) -> FloatArray:
@@ -515,7 +521,7 @@ def whiten_reading(y: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatAr
     variance 1.
     """
     # One solve for y and H together.
-    whitened = np.linalg.solve(np.linalg.cholesky(R), np.column_stack([y, H]))
+    whitened = np.linalg.solve(np.linalg.cholesky(as_floats(R)), np.column_stack([y, H]))
     return np.ascontiguousarray(whitened[:, 0]), np.ascontiguousarray(whitened[:, 1:])
 
 
@@ -541,7 +547,7 @@ def sample_update(
         gain = S @ S.T @ np.linalg.solve(R, H).T
         return xhat + gain @ (y - H @ xhat), S
     (p, n), (white_y, white_H) = H.shape, whiten_reading(y, H, R)
-    x, S = np.array(xhat).reshape(1, n, 1), np.array(lower(root)).reshape(1, n, n, 1)
+    x, S = np.array(xhat, float).reshape(1, n, 1), np.array(lower(root)).reshape(1, n, n, 1)
     scratch = np.empty((n, 1)), np.empty((n, 1))
     _use_rows(x, S, white_y.reshape(1, p, 1), white_H.reshape(1, p, n, 1), scratch)
     return x.reshape(n), S.reshape(n, n)

@@ -31,6 +31,7 @@ from netkf.algorithms.models import (
     FlowModel,
     MapModel,
     RateModel,
+    as_floats,
     first_root,
     lower,
     whiten_reading,
@@ -115,7 +116,12 @@ class Payload:
 
     def _replace(self, **fields: Any) -> Payload:
         """Return a payload with other values of some fields, as of a NamedTuple."""
-        arrays = {name: _as_read(name, value)[None, ..., None] for name, value in fields.items()}
+        arrays = {
+            name: np.array(_as_read(name, value), self.fields[name].dtype, order="C")[
+                None, ..., None
+            ]
+            for name, value in fields.items()
+        }
         return Payload({**self.fields, **arrays}, self.reading, self.sender)
 
 
@@ -518,10 +524,9 @@ def _field(payload: Any, name: str, receiver: int) -> np.ndarray:
     if isinstance(payload, Payload):
         k = payload.number_to(receiver)
         return payload.fields[name][k : k + 1]
-    value = np.asarray(getattr(payload, name), dtype=np.float64)
-    return _as_read(name, value)[None, ..., None]
+    return as_floats(_as_read(name, getattr(payload, name)))[None, ..., None]
 
 
-def _as_read(name: str, value: Any) -> np.ndarray:
-    """Return the ``value`` of a field that Python has set, as kernels read it."""
-    return lower(np.asarray(value)) if name == "root" else np.asarray(value)
+def _as_read(name: str, value: Any) -> Any:
+    """Return the ``value`` of a field that Python has set, with a root as kernels read it."""
+    return lower(value) if name == "root" else value
