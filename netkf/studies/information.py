@@ -216,14 +216,16 @@ class BackwardSearch:
             segment = int(self.flow.target[message])
         return path
 
-    def needed(self, message: int) -> int | None:
-        """Return the unused messages that ``message`` needs, with itself, or None."""
+    def needed(self, messages: IntArray) -> IntArray:
+        """Return how many unused messages each of ``messages`` (K,) needs, itself included; NEVER
+        if it cannot matter.
+        """
         # ``deadline`` is the row before which information has to be in a segment to reach the node.
-        used, cost = self.flow.messages.used_row[message], int(self.flow.cost[message])
-        for budget in range(len(self.deadline) - cost):
-            if NEVER < used < self.deadline[budget, self.flow.target[message]]:
-                return budget + cost
-        return None
+        flow = self.flow
+        used, cost = flow.messages.used_row[messages], flow.cost[messages]
+        reaches = (used > NEVER) & (used < self.deadline[:, flow.target[messages]])
+        count = reaches.argmax(axis=0) + cost
+        return np.where(reaches.any(axis=0) & (count < len(self.deadline)), count, NEVER)
 
 
 def search_back(flow: Flow, node: int, budget: int = 0) -> BackwardSearch:

@@ -17,6 +17,7 @@ from netkf.runs.outcomes import downtimes
 from netkf.scenario.scenario import Scenario
 from netkf.studies.explanation import GOOD_ENOUGH, InformationSource, Missing, WhatIf, Why
 from netkf.studies.information import (
+    NEVER,
     OUTCOMES,
     USED,
     BackwardSearch,
@@ -207,9 +208,10 @@ class _Evidence:
         """Return the unused messages whose information could have reached the node."""
         # The cost of a message is 1 if it was not used in the run, else 0.
         unused = np.flatnonzero(self._flow.cost)
+        needed = self._reach.needed(unused)
+        unused, counts = unused[needed != NEVER], needed[needed != NEVER].tolist()
         times, keys = self.messages.sent[unused].tolist(), message_keys(self.messages[unused])
-        rows = zip(keys, times, map(self._reach.needed, unused.tolist()), strict=True)
-        return [Candidate(key, sent, needed) for key, sent, needed in rows if needed is not None]
+        return list(map(Candidate, keys, times, counts))
 
     def sources(self) -> tuple[InformationSource, ...]:
         """Return what had reached the node from every other node and its own sensor."""

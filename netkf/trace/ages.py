@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -12,8 +13,8 @@ from netkf.linalg.compiling import kernel
 from netkf.linalg.structs import Struct
 from netkf.trace.schema import CODES
 
-SENSE, SEND, DROP, DELIVER, USE, STOP, FORGET = range(1, 8)
-"""What an event does to ages; others do nothing."""
+NOTHING, SENSE, SEND, DROP, DELIVER, USE, STOP = range(7)
+"""What an event does to ages."""
 ACTIONS = np.zeros(len(CODES), dtype=np.int64)
 for _kind, _action in (
     ("sense", SENSE),
@@ -27,10 +28,10 @@ for _kind, _action in (
     ("leave", STOP),
 ):
     ACTIONS[CODES[_kind]] = _action
-OF_SENDER = np.isin(np.arange(len(CODES)), [CODES["send"], CODES["lost"]])
+MAX_DENSE, MAX_ID = 1000, 4000
+"""Nodes up to which links are found in a table of all pairs, and ids up to which nodes are."""
+OF_SENDER = (CODES["send"], CODES["lost"])
 """Kinds of events of a message that are events of its sender; others are of the receiver."""
-MAX_DENSE = 1000
-"""Nodes up to which links are found in a table of all pairs."""
 CAPACITY = 64
 """Messages under way for which there is room at first."""
 
@@ -40,8 +41,11 @@ class AgeState(Struct):
 
     newest, since : (N, S) time of the newest reading of each source that a node has, and since when
     area, peak    : (N, S) integral of its age until then, and the largest age before then
+    nodes, links  : (N,) ids and (D,) codes of directed links, sender N + receiver, sorted
+    place, link   : place in nodes of each id, and in links of each code; empty if there are many
     own           : (N,) column of the node, -1 if it is no source
     steady        : (N,) True for sources that read continuously
+    forgetful     : (N,) True for nodes that know nothing after they were down
     held          : (C, S) what messages tell; number, sender, following (C,): of which of its link,
                     of which node, and the next one in a list
     under_way     : (D,) first message in the list of each directed link
@@ -54,8 +58,13 @@ class AgeState(Struct):
     since: FloatArray
     area: FloatArray
     peak: FloatArray
+    nodes: np.ndarray
+    links: np.ndarray
+    place: np.ndarray
+    link: np.ndarray
     own: np.ndarray
     steady: np.ndarray
+    forgetful: np.ndarray
     held: FloatArray
     number: np.ndarray
     sender: np.ndarray
@@ -94,23 +103,31 @@ class Ages:
         tells_all: Callable[[int], bool],
         read_at: Callable[[np.ndarray, FloatArray], FloatArray],
     ) -> None:
-        self._nodes, self._tells_all, self._read_at = np.array(nodes), tells_all, read_at
-        self._forgetful = np.isin(self._nodes, forgetful)
-        ends = np.searchsorted(self._nodes, np.array(links, dtype=np.int64).reshape(-1, 2))
-        self._links = ends[:, 0] * len(nodes) + ends[:, 1]
-        self._link: np.ndarray | None = None
+        self._tells_all, self._read_at = tells_all, read_at
+        ids = np.array(nodes)
+        ends = np.searchsorted(ids, np.array(links, dtype=np.int64).reshape(-1, 2))
+        codes = ends[:, 0] * len(nodes) + ends[:, 1]
+        place = link = np.empty(0, dtype=np.int64)
+        if 0 <= nodes[0] <= nodes[-1] <= MAX_ID:
+            place = np.zeros(nodes[-1] + 1, dtype=np.int64)
+            place[ids] = np.arange(len(nodes))
         if len(nodes) <= MAX_DENSE:
-            self._link = np.zeros(len(nodes) ** 2, dtype=np.int64)
-            self._link[self._links] = np.arange(len(links))
+            link = np.zeros(len(nodes) ** 2, dtype=np.int64)
+            link[codes] = np.arange(len(codes))
         shape = len(nodes), len(sources)
         own = np.full(len(nodes), -1)
-        own[np.searchsorted(self._nodes, sources)] = np.arange(len(sources))
+        own[np.searchsorted(ids, sources)] = np.arange(len(sources))
         self._columns: dict[str, Any] = dict(
             zip(("newest", "since", "area", "peak"), np.zeros((4, *shape)), strict=True)
         )
         self._columns |= {
+            "nodes": ids,
+            "links": codes,
+            "place": place,
+            "link": link,
             "own": own,
-            "steady": np.isin(self._nodes, steady),
+            "steady": np.isin(ids, steady),
+            "forgetful": np.isin(ids, forgetful),
             "held": np.empty((0, len(sources))),
             **dict.fromkeys(("number", "sender", "following"), np.empty(0, dtype=np.int64)),
             "under_way": np.full(len(links), -1),
@@ -135,38 +152,15 @@ class Ages:
 
     def add(self, rows: np.ndarray) -> None:
         """Follow the next block of EVENT ``rows`` (K,)."""
-        kept = np.flatnonzero(ACTIONS[rows["kind"]])
-        # Column by column: copies of whole rows take longer.
-        kind, ids, peers, t, number, phase = (
-            rows[name][kept] for name in ("kind", "node", "peer", "t", "message", "phase")
-        )
-        action, time = ACTIONS[kind], t
-        node, peer = self._index(ids), self._index(peers)
-        # A message has a link, other events have none.
-        of_sender = OF_SENDER[kind]
-        code = np.where(of_sender, node, peer) * len(self._nodes)
-        code += np.where(of_sender, peer, node)
-        link = np.searchsorted(self._links, code) if self._link is None else self._link[code]
-        sensed = np.flatnonzero(action == SENSE)
-        time[sensed] = self._read_at(ids[sensed], t[sensed])
-        action[sensed[np.isnan(time[sensed])]] = 0
-        action[(action == STOP) & self._forgetful[node]] = FORGET
-        tells_all = np.ones(len(phase), dtype=bool)
-        for one in range(int(phase.min(initial=0)), int(phase.max(initial=0)) + 1):
-            if not self._tells_all(one):
-                tells_all[phase == one] = False
-        columns = action, time, node, link, number, tells_all
+        times, phases = rows["t"].copy(), int(rows["phase"].max(initial=0)) + 1
+        sensed = np.flatnonzero(rows["kind"] == CODES["sense"])
+        times[sensed] = self._read_at(rows["node"][sensed], times[sensed])
+        tells_all = np.array([self._tells_all(phase) for phase in range(-1, phases)])
         done = 0
-        while done < len(kept):
-            done = follow(self._state, *columns, done)
-            if done < len(kept):
+        while done < len(rows):
+            done = follow(self._state, rows, times, tells_all, done)
+            if done < len(rows):
                 self._grow(len(self._columns["number"]))
-
-    def _index(self, ids: np.ndarray) -> np.ndarray:
-        """Return the indices (K,) of nodes, of -1 any."""
-        if int(self._nodes[-1]) == len(self._nodes) - 1 and self._nodes[0] == 0:
-            return np.asarray(np.maximum(ids, 0))
-        return np.asarray(np.searchsorted(self._nodes, ids))
 
     def finish(self, end: float) -> tuple[FloatArray, FloatArray]:
         """Return the mean from 0 to ``end`` seconds and the largest value (N, S) of the age of each
@@ -250,42 +244,53 @@ def use_waiting(s: AgeState, i: int, t: float) -> None:
 
 
 @kernel
+def find(table: np.ndarray, values: np.ndarray, value: int) -> int:
+    """Return the place of a value in sorted ``values``, by a ``table`` of places unless empty."""
+    if len(table) > 0:
+        return int(table[value])
+    return int(np.searchsorted(values, value))
+
+
+@kernel
 def follow(
-    s: AgeState,
-    action: np.ndarray,
-    time: FloatArray,
-    node: np.ndarray,
-    link: np.ndarray,
-    number: np.ndarray,
-    tells_all: np.ndarray,
-    first: int,
+    s: AgeState, rows: np.ndarray, times: FloatArray, tells_all: np.ndarray, first: int
 ) -> int:
-    """Follow K events from number ``first`` on; return how many are done, fewer than K where there
-    is no room for a message.
+    """Follow K EVENT ``rows`` from number ``first`` on; return how many are done, fewer than K
+    where there is no room for a message. times (K,): when a reading was taken, nan where there was
+    none, else the time of the event; tells_all: by phase + 1.
     """
-    for e in range(first, len(action)):
-        i, t = node[e], time[e]
-        if action[e] == SEND:
-            if s.free[-1] == 0:
+    for e in range(first, len(rows)):
+        row, t = rows[e], times[e]
+        kind = row["kind"]
+        action = ACTIONS[kind]
+        if action == NOTHING:
+            continue
+        i, k = find(s.place, s.nodes, row["node"]), 0
+        if SEND <= action <= DELIVER:
+            j = find(s.place, s.nodes, row["peer"])
+            # What is sent or lost is an event of the sender, what comes one of the receiver.
+            code = i * len(s.nodes) + j if kind in OF_SENDER else j * len(s.nodes) + i
+            link = find(s.link, s.links, code)
+            if action == SEND and s.free[-1] == 0:
                 return e
+            k = find_message(s, link, row["message"]) if action != SEND else 0
+        if action == SEND:
             s.free[-1] -= 1
             k = s.free[s.free[-1]]
-            s.number[k], s.sender[k] = number[e], i
-            s.following[k], s.under_way[link[e]] = s.under_way[link[e]], k
-            fill_message(s, i, k, t, tells_all[e])
-        elif action[e] == DROP or action[e] == DELIVER:
-            k = find_message(s, link[e], number[e])
-            if k >= 0 and action[e] == DROP:
-                replace_message(s, k)
-            elif k >= 0:
-                s.following[k], s.inbox[i] = s.inbox[i], k
-        elif action[e] == USE:
+            s.number[k], s.sender[k] = row["message"], i
+            s.following[k], s.under_way[link] = s.under_way[link], k
+            fill_message(s, i, k, t, tells_all[row["phase"] + 1])
+        elif action == DROP and k >= 0:
+            replace_message(s, k)
+        elif action == DELIVER and k >= 0:
+            s.following[k], s.inbox[i] = s.inbox[i], k
+        elif action == USE:
             use_waiting(s, i, t)
-        elif action[e] == SENSE:
+        elif action == SENSE and not math.isnan(t):
             renew(s, i, s.own[i], t, t)
-        elif action[e] == STOP or action[e] == FORGET:
+        elif action == STOP:
             # What a node had heard and not used when it went down is lost.
             clear(s, i)
-            for c in range(s.newest.shape[1] if action[e] == FORGET else 0):
+            for c in range(s.newest.shape[1] if s.forgetful[i] else 0):
                 renew(s, i, c, 0.0, t)
-    return len(action)
+    return len(rows)
