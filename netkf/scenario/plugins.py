@@ -94,7 +94,9 @@ def unguarded_line(scenario: Any) -> tuple[int, int] | None:
 
 
 def find_module_files(scenario: Component) -> dict[str, Path | None]:
-    """Return the files of modules of users' classes by name, None for those outside its folder."""
+    """Return the files of modules of users' classes, and of those in their folder that these
+    import, by name; None for those outside the scenario's folder.
+    """
     folder = getattr(scenario, "_folder", None)
     files: dict[str, Path | None] = {}
     for component in user_components(scenario):
@@ -106,7 +108,35 @@ def find_module_files(scenario: Component) -> dict[str, Path | None]:
         # The loaded module may be it where no other file is known.
         if file is None or not Path(file).is_file() or path.samefile(file):
             files[name] = path
+            files = imports_beside(folder, name) | files
     return files
+
+
+def imports_beside(folder: Path, name: str) -> dict[str, Path | None]:
+    """Return the modules that the file of module ``name`` in ``folder`` imports from there, and
+    those that these import, by name: their files, None for packages.
+    """
+    found: dict[str, Path | None] = {}
+    waiting = [folder / f"{name}.py"]
+    while waiting:
+        try:
+            nodes = list(ast.walk(ast.parse(waiting.pop().read_bytes())))
+        except (OSError, SyntaxError, ValueError):  # importing it says what is wrong
+            continue
+        imported = [
+            alias.name for one in nodes if isinstance(one, ast.Import) for alias in one.names
+        ]
+        imported += [one.module or "" for one in nodes if isinstance(one, ast.ImportFrom)]
+        for module in {full.partition(".")[0] for full in imported} - {name, *found}:
+            path = folder / f"{module}.py"
+            if module in sys.stdlib_module_names:
+                continue
+            if (folder / module / "__init__.py").is_file():
+                found[module] = None
+            elif path.is_file():
+                found[module] = path
+                waiting.append(path)
+    return found
 
 
 def explain_user_error(scenario: Any, error: Exception) -> str | None:
@@ -241,7 +271,8 @@ def find_class(kind: str, origin: Origin) -> Any:
     path = [*(folder for folder in folders if folder not in sys.path), *sys.path]
 
     def load() -> Any:
-        unload_namesake(module_name, origin.folder)
+        for name in (module_name, *imports_beside(origin.folder, module_name)):
+            unload_namesake(name, origin.folder)
         return getattr(importlib.import_module(module_name), class_name)
 
     return _load(kind, load, path, module_name)

@@ -12,6 +12,7 @@ import pytest
 
 import netkf
 from netkf.cli.main import main
+from netkf.runs.files import scenario_digest
 from netkf.scenario import plugins
 from netkf.scenario.plugins import find_module_files
 from netkf.scenario.writing import as_table, to_toml
@@ -396,3 +397,22 @@ def test_workers_import_nothing_from_the_current_folder(folder):
     )
     assert (done.returncode, done.stderr) == (0, "")
     assert not ran(folder)
+
+
+def test_what_a_class_imports_from_its_folder_comes_along(folder, tmp_path):
+    """A run directory has it, also a second file has its own, and a changed one is another run."""
+    for place, epsilon in ((folder, 0.1), (tmp_path / "other", 0.2)):
+        module(place / "evil.py", "import json, midway\nclass P(midway.Base):\n    pass\n")
+        base = "from lowest import EPSILON\n\n\nclass Base(P):\n    own = EPSILON\n"
+        module(place / "midway.py", PART + base)
+        (place / "lowest.py").write_text(f"EPSILON = {epsilon}\n")
+        (place / "json.py").write_text("raise RuntimeError\n")
+        first = netkf.load(scenario(place))
+        assert first.filter.algorithm.own == epsilon
+        assert set(find_module_files(first)) == {"evil", "midway", "lowest"}
+    short = first.replace({"horizon": 1.0})
+    out = netkf.save(netkf.simulate(short), short, tmp_path / "out")
+    assert {"evil.py", "midway.py", "lowest.py"} <= {file.name for file in out.iterdir()}
+    digest = scenario_digest(first)
+    (tmp_path / "other" / "lowest.py").write_text("EPSILON = 0.3\n")
+    assert scenario_digest(first) != digest
