@@ -159,9 +159,9 @@ def require_errors(scenario: Scenario) -> None:
     if reasons and (in_python or scenario.views is not None):
         rule = "exact errors are known of filters whose verbs are affine kernels of one state"
         raise TheoryError(f"{reasons[0]}: {rule}; {CONSISTENCY}")
-    if scenario.has_mistimed_increments:
-        rule = "exact errors with wrong clocks are known of sensors that sample"
-        raise TheoryError(f"{rule}, not of those that give increments; {CONSISTENCY}")
+    if scenario.has_mistimed_increments and scenario.has_mistimed_models:
+        rule = "exact errors of increments with wrong clocks are known without inputs and changes"
+        raise TheoryError(f"{rule} that filters know; {CONSISTENCY}")
     if scenario.links_follow_state and scenario.node_filter.timing.talks:
         raise TheoryError("the true state says who hears whom: events tell of it")
     kernels = compiled_kernels(scenario.node_filter, clocked=True)

@@ -125,7 +125,9 @@ class ClockColumns(LoggedColumns):
         if piece < len(self._scenario.model_pieces):
             self._filters.clocked.begin_piece(piece)
         self._lay_laws(piece)
-        self._flows_of_all = increment_flows(self._scenario, self.estimators, piece)
+        clocks = [self._clocks.get(node) for node in self._scenario.nodes[: self.estimators]]
+        paces = [1.0 if clock is None else clock.pace for clock in clocks]
+        self._flows_of_all = increment_flows(self._scenario, self.estimators, piece, paces)
         self._begin_flows()
 
     def _begin_flows(self) -> None:
@@ -219,7 +221,7 @@ class ClockColumns(LoggedColumns):
         flows.advance(forms, self._x, filters.xhat_rows, filters.roots, (self._now, time))
         self._now = time
         for h in flows.reading:
-            self._times[h] = time
+            self._times[h] = self._clock_reading(h, time)
         self._keep_digits(flows.reading)
 
     def _gap(self, h: int, time: float) -> float:

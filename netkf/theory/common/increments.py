@@ -7,7 +7,7 @@ the verbs of filters go in short steps.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from netkf.linalg.arrays import FloatArray, IntArray, square_root
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.forms import MEAN, Forms
-from netkf.theory.common.observations import increment_observations
+from netkf.theory.common.observations import Observation, increment_observations
 from netkf.theory.numerics.prediction import NODES, WEIGHTS, ErrorFlow, StateFlow
 
 
@@ -26,8 +26,9 @@ class IncrementFlows(NamedTuple):
              propagated together
     reading : the estimators in them, which read increments
     plant : the flow of the true state
-    follows : whether errors depend on the state, because the filters' A is not the plant's: flows
-              are then those of the state and the error together, of which only the error has a P
+    follows : whether errors depend on the state, because the filters' A is not the plant's or a
+              clock is wrong: flows are then those of the state and the error together, of which
+              only the error has a P
     surprise : the response to an input that is left in the state, or None; n more noises of the
                plant then stand for what drives it, which is known
     """
@@ -119,8 +120,12 @@ def integration_steps(scenario: Scenario) -> int:
     return math.ceil(scenario.horizon / min(units)) if units else 0
 
 
-def increment_flows(scenario: Scenario, estimators: int, piece: int = 0) -> IncrementFlows | None:
-    """Return how errors with increments evolve in a ``piece`` of the plant; None without any."""
+def increment_flows(
+    scenario: Scenario, estimators: int, piece: int = 0, paces: Sequence[float] | None = None
+) -> IncrementFlows | None:
+    """Return how errors with increments evolve in a ``piece`` of the plant; None without any.
+    ``paces`` are the seconds that pass by the clock of each estimator in a second, 1 by default.
+    """
     observations = increment_observations(scenario)
     if not any(len(observation.H) for observation in observations):
         return None
@@ -130,26 +135,41 @@ def increment_flows(scenario: Scenario, estimators: int, piece: int = 0) -> Incr
     B = plant[1] if np.array_equal(plant[1] @ plant[1].T, Q) else square_root(Q)
     if scenario.surprise is not None:
         plant = (plant[0], np.column_stack([plant[1], np.eye(len(A))]))
-    noise = plant[1]
-    follows = not np.array_equal(A, plant[0])
-    if follows:
-        # d(x, e) = (A x, (A - A_f) x + (A_f - L H) e) dt + (B, B) dw, less the noise of L dv in e.
-        zero, noise = np.zeros_like(A), np.concatenate([plant[1], plant[1]])
-        B = np.concatenate([np.zeros_like(B), B])
-        A = np.block([[plant[0], zero], [plant[0] - A, A]])
-    members: dict[bytes, list[int]] = {}
-    flows: dict[bytes, ErrorFlow] = {}
-    for h, observation in enumerate(observations[:estimators]):
+    paces = [1.0] * estimators if paces is None else paces
+    follows = not np.array_equal(A, plant[0]) or any(pace != 1.0 for pace in paces)
+    members: dict[tuple[bytes, float], list[int]] = {}
+    flows: dict[tuple[bytes, float], ErrorFlow] = {}
+    for h, (observation, pace) in enumerate(zip(observations, paces, strict=False)):
         if not len(observation.H):
             continue
-        # Estimators with equal sensors share a flow.
-        key = b"|".join(part.tobytes() for part in observation)
+        # Estimators with equal sensors and clocks share a flow.
+        key = b"|".join(part.tobytes() for part in observation), pace
         members.setdefault(key, []).append(h)
         if key not in flows:
-            H = observation.H
-            if follows:
-                H = np.concatenate([np.zeros_like(H), H], axis=1)
-            flows[key] = ErrorFlow(A, B, H, observation.R, observation.root, noise)
+            flows[key] = _error_flow((A, B), plant, observation, pace, follows)
     groups = [(flows[key], np.array(members[key])) for key in flows]
     reading = [h for indices in members.values() for h in indices]
     return IncrementFlows(groups, reading, StateFlow(*plant), follows, scenario.surprise)
+
+
+def _error_flow(
+    believed: tuple[FloatArray, FloatArray],
+    plant: tuple[FloatArray, FloatArray],
+    observation: Observation,
+    pace: float,
+    follows: bool,
+) -> ErrorFlow:
+    """Return the flow of an error, or with ``follows`` of state and error, from A and B that are
+    believed and those of the plant; ``pace`` seconds pass by the clock in a second.
+    """
+    (A, B), H, noise = believed, observation.H, plant[1]
+    # The filter moves so much further, and its gain P H' R^-1 is that of its own time.
+    A, B, R = pace * A, math.sqrt(pace) * B, pace * observation.R
+    if follows:
+        # d(x, e) = (A x, (A - A_f) x + (A_f - L H) e) dt + (B, B) dw, less the noise of L dv in e.
+        # Of dy = H x dt + dv the filter expects pace H xhat dt.
+        zero, noise = np.zeros_like(A), np.concatenate([noise, noise])
+        B = np.concatenate([np.zeros_like(B), B])
+        A = np.block([[plant[0], zero], [plant[0] - A, A]])
+        H = np.concatenate([(1.0 - pace) * H, pace * H], axis=1)
+    return ErrorFlow(A, B, H, R, observation.root, noise)
