@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from netkf.core.contracts import is_netkf_class
 from netkf.core.csv_files import read_columns
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
@@ -222,7 +223,7 @@ def lifetimes(scenario: Any, streams: Any) -> dict[int, Lifetime]:
                 return generator
 
             # The last slot is finished after the horizon, for its sample.
-            changes = life.changes(node, random, scenario.end_time)
+            changes = _stated_changes(life, life.changes(node, random, scenario.end_time))
             up = not changes or not changes[0].up
             instants = [c._replace(time=scenario.time_grid.instant(c.time)) for c in changes]
             forgets = node in forgetful
@@ -230,6 +231,26 @@ def lifetimes(scenario: Any, streams: Any) -> dict[int, Lifetime]:
                 instants = _begun_with_slots(instants, scenario.slot_plant)
             kept = tuple(c for c in instants if c.time < scenario.end_time)
             found[node] = Lifetime(up, kept, forgets)
+    return found
+
+
+def _stated_changes(life: Life, given: Any) -> Sequence[Change]:
+    """Return the changes ``given`` by a ``life``; raises ScenarioError where a user's are none."""
+    if is_netkf_class(type(life)):
+        return list(given)
+    try:
+        found = [Change(float(time), kind) for time, kind in given]
+    except (TypeError, ValueError):
+        found = [Change(math.nan, "")]
+    times, ups = [0.0, *(one.time for one in found)], [one.up for one in found]
+    in_order = all(a <= b for a, b in itertools.pairwise(times))
+    in_turn = all(a != b for a, b in itertools.pairwise(ups))
+    if not (in_order and in_turn and {one.kind for one in found} <= {*UP, *DOWN}):
+        rule = (
+            f"{type(life).__name__}.changes must return Change(time, kind) in the order of time, "
+        )
+        remedy = f"kinds are {', '.join((*UP, *DOWN))}"
+        raise ScenarioError("network.lives", rule + "up and down in turn", given, remedy)
     return found
 
 

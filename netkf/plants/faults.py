@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.core.errors import ScenarioError
+from netkf.core.errors import ScenarioError, quote
 from netkf.core.fields import (
     Component,
     either,
@@ -158,7 +158,19 @@ class FaultyReadings:
     def given(self, k: int, y: FloatArray) -> FloatArray:
         """Return what the sensor gives in place of its healthy reading number ``k``, y (p,)."""
         time = self._when(k)
-        return np.asarray(self._give(time, y)) if self._fault.holds(time) else y
+        if not self._fault.holds(time):
+            return y
+        given = self._give(time, y)
+        result = np.asarray(given)
+        is_right = result.dtype.kind in "fiu" and result.shape == y.shape
+        # A state that has left the numbers has no reading that could be healthy.
+        if not is_right or (np.isfinite(y).all() and not np.isfinite(result).all()):
+            rule = (
+                f"what {type(self._fault).__name__}.begin returns must give finite numbers of the "
+            )
+            rule += f"shape {y.shape}, not {quote(given)}, at {time:g} s"
+            raise ScenarioError("sensors.fault", rule)
+        return result.astype(np.float64, copy=False)
 
     def reading(self, k: int, x: FloatArray) -> Any:
         """Return the reading number ``k``, see ``Readings`` and ``Samples``."""

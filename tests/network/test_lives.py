@@ -1,6 +1,8 @@
 """Nodes that crash, sleep, join and leave."""
 
 import json
+import math
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ import scipy.linalg
 import scipy.stats
 
 import netkf
-from netkf.network.lives import Crashes, DutyCycle
+from netkf.network.lives import Change, Crashes, DutyCycle, Life
 from netkf.theory.errors import error_law
 from netkf.trace.schema import CODES
 from tests.engines.agreement import assert_agree
@@ -681,6 +683,32 @@ def test_a_node_that_goes_up_after_the_run_is_down_in_it(scenario_of, life, memo
             sent = run.events["kind"].isin(["sense", "send", "transmit", "absorb"])
             assert 1 not in set(run.events["node"][sent])
     assert len(prints) == 1
+
+
+@dataclass(frozen=True, eq=False)
+class Stated(Life):
+    def changes(self, node, random, horizon):
+        return Stated.value
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        [Change(2.0, "crash"), Change(1.0, "restart")],
+        [Change(1.0, "crash"), Change(2.0, "crash")],
+        [Change(-1.0, "crash")],
+        [Change(math.nan, "crash")],
+        [Change(1.0, "down")],
+        [1.0],
+    ],
+)
+def test_a_life_of_a_user_goes_up_and_down_in_turn(scenario_of, value, monkeypatch):
+    monkeypatch.setattr(Stated, "value", value, raising=False)
+    scenario = scenario_of(CLOCKS, "", {}).replace({"network.lives": [Stated(nodes=[1])]})
+    with pytest.raises(
+        netkf.ScenarioError, match=r"Stated.changes must return Change\(time, kind\)"
+    ):
+        netkf.simulate(scenario)
 
 
 @pytest.mark.parametrize("engine", ["simpy", "compiled"])

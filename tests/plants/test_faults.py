@@ -1,12 +1,14 @@
 """Sensors that are stuck, biased, drifting or have outliers."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 import scipy.linalg
 
 import netkf
 from netkf.core.errors import ScenarioError
-from netkf.plants.faults import Biased, Drifting, FaultyReadings, Outliers, Stuck
+from netkf.plants.faults import Biased, Drifting, Fault, FaultyReadings, Outliers, Stuck
 from netkf.rng.streams import Streams
 
 # Without noise estimates are a linear map of x(0) and of the fault, which is written plainly here.
@@ -246,6 +248,22 @@ def test_faults_of_users_run_in_both_engines(scenario_of, tmp_path, monkeypatch,
     np.testing.assert_allclose(one.xhat, other.xhat, atol=1e-10)
     assert one.fingerprint == other.fingerprint
     assert abs(one.xhat - netkf.simulate(scenario_of("", slots), seed=1).xhat).max() > 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Gives(Fault):
+    def begin(self, random):
+        return lambda time, y: Gives.value
+
+
+@pytest.mark.parametrize(
+    "value", [1.0, [1.0], [[1.0], [2.0]], [1.0, np.nan], [1j, 0.0], None, "ab"]
+)
+def test_what_a_fault_of_a_user_gives_must_be_a_reading(value, monkeypatch):
+    monkeypatch.setattr(Gives, "value", value, raising=False)
+    path = FaultyReadings(Path(), Gives(), np.random.default_rng(1), float)
+    with pytest.raises(ScenarioError, match=r"what Gives.begin returns must give finite numbers"):
+        path.reading(3, np.zeros(2))
 
 
 class Path:
