@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from numbers import Real
+from numbers import Integral, Real
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, Protocol
 
@@ -256,14 +256,18 @@ def _sound_timing(timing: Any) -> Timing:
     is_schedule = schedule is None or (isinstance(schedule, tuple) and set(schedule) <= {*PHASES})
     are_clocks = isinstance(clocks, tuple) and set(clocks) <= {*CLOCKS}
     is_slot = first is None or (isinstance(first, int) and first >= 0)
+    exchanges = schedule.count("exchange") if is_schedule and schedule else 0
+    steps = [timing.steps(phase) for phase in range(exchanges)]
+    are_steps = all(isinstance(count, Integral) and int(count) >= 0 for count in steps)
     for name, holds, rule in (
         ("schedule", is_schedule, f"must be None or a tuple of {phases}"),
         ("clocks", are_clocks, f"must be a tuple of {names}"),
         ("first_slot", is_slot, "must be a whole number of at least 0"),
+        ("steps", are_steps, "must return a whole number of at least 0 for each exchange"),
         ("max_age", isinstance(age, Real) and float(age) >= 0.0, "must be a number of at least 0"),
     ):
         if not holds:
-            raise ScenarioError(name, rule, getattr(timing, name))
+            raise ScenarioError(name, rule, steps if name == "steps" else getattr(timing, name))
     return timing
 
 

@@ -113,6 +113,7 @@ MISTAKES = {
                          r"F\.link_weights\.of: must be a finite number .*; got 5\.0"),
     "a schedule that is a text": ("FILTER", f"timing = Timing(schedule='exchange')\n{SAME}",
                                   r'F\.timing\.schedule: must be None or a tuple of "predict", "sense", "exchange"; got'),
+    "half a step": ("FILTER", f"timing = Timing(steps=lambda phase: 2.5)\n{SAME}", r"F\.timing\.steps: must return a whole number of at least 0"),
     "an age that is a text": ("FILTER", f"timing = Timing(max_age='x')\n{SAME}", r"F\.timing\.max_age: must be a number"),
     "notes fail": ("FILTER", f"needs = Needs(notes=lambda scenario: 1 / 0)\n{SAME}",
                    r"F failed in needs: ZeroDivisionError.*; FILE, line 6"),
