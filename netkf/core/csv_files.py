@@ -312,7 +312,9 @@ def _split_text(text: str) -> list[str]:
 
 
 def is_number_text(text: str) -> bool:
-    """Return True for a number, with a decimal point or comma."""
+    """Return True for a number, with a decimal point or comma; 1_2 is none, but a name."""
+    if "_" in text:
+        return False
     try:
         float(text.replace(",", "."))
     except ValueError:

@@ -36,6 +36,8 @@ def bind_names(part: Any, names: Names | None) -> Any:
         # Nodes that were taken from a table are taken again, when it is read again.
         codes = set(getattr(getattr(owner, "path", None), "unknown", {}).values())
         is_taken = isinstance(value, tuple) and bool(codes.intersection(value))
+        listed = getattr(getattr(owner, "record", None), "listed", None)
+        is_taken = is_taken or (bool(ids) and value is not None and value is listed)
         return None if is_taken else _bind_nodes(value, names)
 
     return rebuild(part, change)

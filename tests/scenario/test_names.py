@@ -103,11 +103,14 @@ def test_names_in_all_tables_and_fields_are_the_run_with_ids(named, tmp_path):
     assert sampled.sensors[0].sampling.ticks((1,), 0.0, 0, 0.0, None, 9).tolist() == [1.2, 3.0]
 
 
-def test_addresses_that_look_like_numbers_are_names_and_messages_say_what_a_name_is(folder):
+@pytest.mark.parametrize("address", ["12e4", "1_2"])
+def test_addresses_that_look_like_numbers_are_names_and_messages_say_what_a_name_is(
+    folder, address
+):
     for name, text in TABLES.items():
-        (folder / name).write_text(text.replace("lab", "12e4"))
-    table = json.loads(json.dumps(SCENARIO).replace("lab", "12e4"))
-    assert dict(from_table(table, folder).topology.names) == {"12e4": 0, "roof": 1, "cellar": 2}
+        (folder / name).write_text(text.replace("lab", address))
+    table = json.loads(json.dumps(SCENARIO).replace("lab", address))
+    assert dict(from_table(table, folder).topology.names) == {address: 0, "roof": 1, "cellar": 2}
     for name in ("", "a\nb", "x" * 300):
         table["sensors"][0]["nodes"][0] = name
         rule = r"must be an id, or a name of at most \d+ printable characters"
@@ -335,3 +338,17 @@ def test_edges_of_a_graph_must_agree():
         )
     with pytest.raises(netkf.ScenarioError, match="two nodes have one name"):
         netkf.network.graph_files.from_networkx(networkx.Graph([(1, "1")]))
+
+
+def test_sensors_without_nodes_have_those_of_their_table_by_the_names_of_the_graph(folder):
+    """Names of digits are numbers of nodes only where the graph has no such name."""
+    (folder / "digits.csv").write_text("t,node,y0\n1.0,07,1.0\n2.0,7,2.0\n2.5,3.0,2.0\n")
+    sensor = {"kind": "recorded", "path": "digits.csv", "H": [[1.0]], "R": [[1.0]]}
+    for edges, nodes in (([["07", "7"], ["7", 3]], (0, 3, 7)), ([[7, 3]], (3, 7))):
+        table = SCENARIO | {"sensors": [sensor]}
+        table["plant"] = {"kind": "unknown", "A": [[0.0]], "B": [[1.0]], "cov": [[1.0]]}
+        table["network"] = {
+            "graph": {"kind": "edges", "edges": edges},
+            "activation": {"kind": "poisson", "rate": 1.0},
+        }
+        assert from_table(table, folder).sensing_nodes == nodes
