@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from numbers import Integral, Real
+from numbers import Real
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, Protocol
 
@@ -257,8 +257,8 @@ def _sound_timing(timing: Any) -> Timing:
     are_clocks = isinstance(clocks, tuple) and set(clocks) <= {*CLOCKS}
     is_slot = first is None or (isinstance(first, int) and first >= 0)
     exchanges = schedule.count("exchange") if is_schedule and schedule else 0
-    steps = [timing.steps(phase) for phase in range(exchanges)]
-    are_steps = all(isinstance(count, Integral) and int(count) >= 0 for count in steps)
+    steps: list[Any] = [timing.steps(phase) for phase in range(exchanges)]
+    are_steps = all(isinstance(count, int | np.integer) and count >= 0 for count in steps)
     for name, holds, rule in (
         ("schedule", is_schedule, f"must be None or a tuple of {phases}"),
         ("clocks", are_clocks, f"must be a tuple of {names}"),
