@@ -17,8 +17,7 @@ about a mode that decays would soon be so large that the others lose their digit
 plant (``modes.ModeFrame``): such modes are those of time 0, and information about them stays as it
 is. Where nothing is kept, W is the identity.
 
-The centre is the prediction of the present slot or instant; with the next one it moves to the
-belief.
+The centre is the prediction of the present slot or instant; with the next one, the belief.
 """
 
 from __future__ import annotations
@@ -61,22 +60,15 @@ SLOT, ALL = "slot", "all"
 
 
 @kernel
-def add_part(
-    lanes: Lanes, size: Size, total: FloatArray, part: FloatArray, work: FloatArray
-) -> None:
-    """Add the independent evidence ``part`` to ``total``; ``work`` is scratch of that shape."""
+def add_part(lanes: Lanes, size: Size, out: FloatArray, part: FloatArray, work: FloatArray) -> None:
+    """Add the independent evidence ``part`` to ``out``; ``work`` is scratch of that shape."""
     copy_information_root(lanes, part, work)
-    merge_lanes(lanes, size, total, work)
+    merge_lanes(lanes, size, out, work)
 
 
 @kernel
 def predict_part(
-    lanes: Lanes,
-    size: Size,
-    part: FloatArray,
-    back: FloatArray,
-    total: FloatArray,
-    work: FloatArray,
+    lanes: Lanes, size: Size, part: FloatArray, back: FloatArray, out: FloatArray, work: FloatArray
 ) -> None:
     """Predict a part to a later state of a plant without noise, ``Z <- Z back``, with the inverse
     transition ``back`` (n, n); the caller predicts the centre. Two parts are scratch.
@@ -84,7 +76,7 @@ def predict_part(
     # Z (x - c) = Z back (x+ - c+) for x+ - c+ = back^-1 (x - c); Z back is not triangular, so its
     # rows are merged one by one into a triangular root.
     n = len(part)
-    clear_part(lanes, total)
+    clear_part(lanes, out)
     for k in range(n):
         # Merge row k of [Z back, z], as the last row of a lower triangular root.
         clear_part(lanes, work)
@@ -94,8 +86,8 @@ def predict_part(
                 entry += load(lanes, part, k, i) * back[i, j]
             store(lanes, work, n - 1, j, entry)
         store(lanes, work, n - 1, n, load(lanes, part, k, n))
-        merge_lanes(lanes, size, total, work)
-    copy_information_root(lanes, total, part)
+        merge_lanes(lanes, size, out, work)
+    copy_information_root(lanes, out, part)
 
 
 @kernel
@@ -444,7 +436,6 @@ class BeliefPropagation(Filter):
         return not isinstance(model, SlotModel) or self.memory == ALL
 
     def _frame(self, model: Any) -> ModeFrame:
-        """Return the coordinates of evidence."""
         if not isinstance(model, SlotModel):
             return flow_frame(model.A)
         return slot_frame(model.F) if self.memory == ALL else still_frame(len(model.F))

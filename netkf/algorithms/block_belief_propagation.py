@@ -9,8 +9,7 @@ readings of the sender the receiver has independent evidence of its own path (We
 Computation 13, 2001).
 
 It is the path and not the present state alone, because noise of the plant makes everything that is
-known of two nodes depend on each other: messages about the present would be counted again in the
-next slot.
+known of two nodes depend on each other: messages about the present would be counted twice.
 """
 
 from __future__ import annotations
@@ -45,9 +44,7 @@ LATE_NOTE = (
 
 
 def note_loops(scenario: Any) -> tuple[str, ...]:
-    """Return notes for the user where the graph of a ``netkf.Scenario`` has loops, and where
-    messages take time.
-    """
+    """Return notes where the graph of a ``netkf.Scenario`` has loops, and messages take time."""
     rule = "the graph has loops, on which evidence returns and counts again; P is too small"
     notes = [] if is_forest(scenario) else [rule]
     if not scenario.slotted and scenario.network.channel.delay.fixed != 0.0:

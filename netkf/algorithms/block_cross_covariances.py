@@ -2,8 +2,7 @@
 keep for each neighbour how the errors of both correlate.
 
 Luft, Schubert, Roumeliotis and Burgard, "Recursive decentralized localization for multi-robot
-systems with asynchronous pairwise communication", International Journal of Robotics Research
-37(10), 2018.
+systems with asynchronous pairwise communication", Int. J. Robotics Research 37(10), 2018.
 
 The cross-covariance of the errors of nodes i and j is ``A_i C A_j'``. What changes the error of one
 node alone, a prediction, an own reading and, in approximation, what it hears of a third node,
@@ -132,9 +131,7 @@ def predict(record: Any, h: int, run: Any) -> None:
 
 @kernel
 def update(record: Any, h: int, run: Any) -> None:
-    """Use the readings of the node's own block; those of pairs are kept for the exchange of this
-    instant.
-    """
+    """Use the readings of the node's own block; those of pairs wait for this instant's exchange."""
     f = record.fusion
     for q in range(len(run.lanes)):
         f.x[:], f.P[:] = 0.0, 0.0
@@ -195,9 +192,7 @@ def write_message(record: Any, h: int, m: int, run: Any, w: int) -> None:
 
 @kernel
 def absorb(record: Any, h: int, run: Any) -> None:
-    """Use the messages of this instant one after the other, by sender; one that took time is used
-    for nothing.
-    """
+    """Use the messages of this instant in turn, by sender, but for those that took time."""
     for q in range(len(run.lanes)):
         met, n = False, len(run.size)
         for i in range(n):
@@ -306,9 +301,7 @@ def set_factors(record: Any, m: int, w: int, q: int) -> float:
 
 @kernel
 def set_joint(record: Any, h: int, m: int, q: int, crossed: bool) -> None:
-    """Write what node ``h`` and the sender of payload ``m`` have told, with the cross-covariance X
-    (n, n') if ``crossed``.
-    """
+    """Write what node ``h`` and the sender of payload ``m`` told; X (n, n') if ``crossed``."""
     f, n, v, p = record.fusion, len(record.A), len(record.A_j), record.payload
     for i in range(n):
         f.x[i] = record.told[h, i, q]
@@ -324,9 +317,7 @@ def set_joint(record: Any, h: int, m: int, q: int, crossed: bool) -> None:
 
 @kernel
 def use_rows(record: Any, run: Any, r: int, first: int, q: int) -> bool:
-    """Use reading number ``r`` of the node whose states begin at ``first``; False if it says
-    nothing.
-    """
+    """Use reading ``r`` of the node whose states begin at ``first``; False if it says nothing."""
     f, n, place, matrix = record.fusion, len(run.size), run.first_y + r, run.first_H + run.matrix[r]
     count, says = run.rows[r], False
     f.noise[:] = 0.0
@@ -393,9 +384,7 @@ def use_pairs(record: Any, h: int, run: Any, k: int, mine: bool, q: int) -> bool
 
 @kernel
 def hear(record: Any, h: int, run: Any, k: int, q: int) -> None:
-    """Use what the sender of message ``k`` has read, and the pair, for what node ``h`` knows since
-    others were heard.
-    """
+    """Use what the sender of message ``k`` has read, and the pair, since others were heard."""
     f, n, v = record.fusion, len(run.size), len(record.A_j)
     set_own(record, h, n, q)
     for j in range(v):

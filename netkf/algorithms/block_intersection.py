@@ -68,9 +68,7 @@ def add_covariance(
 
 @kernel
 def predict(record: Any, h: int, run: Any) -> None:
-    """Predict node ``h``. The plant's noise is independent of others, if nobody else estimates the
-    same blocks.
-    """
+    """Predict node ``h``; the noise is independent of others, if nobody shares its blocks."""
     lanes, n, dependent = run.lanes, len(run.size), record.dependent
     if record.rule == SPLIT:
         Phi, moved = run.noise, run.moved
@@ -162,9 +160,7 @@ def absorb(record: Any, h: int, run: Any) -> None:
 
 @kernel
 def hear(record: Any, h: int, run: Any, k: int, q: int) -> None:
-    """Use message ``k`` of the inbox in lane ``q``: all that it tells at once, since the sender's
-    error is in all of it.
-    """
+    """Use message ``k`` of the inbox in lane ``q`` at once: the sender's error is in all of it."""
     f, tables, pairs, m, r = record.fusion, record.tables, run.pairs, run.message[k], run.heard[k]
     n, root = len(f.x), record.root
     for i in range(n):
@@ -244,9 +240,7 @@ def predict_sent_blocks(record: Any, h: int, run: Any, k: int) -> None:
 
 @kernel
 def use_common(record: Any, link: int) -> int:
-    """Make the sender's estimate of what both estimate the first rows of an observation; return
-    how many they are.
-    """
+    """Make the sender's estimate of common states the first rows; return how many they are."""
     f, entry, row = record.fusion, record.tables.entry, 0
     for i in range(entry.shape[1]):
         if entry[link, i] >= 0:
@@ -258,13 +252,9 @@ def use_common(record: Any, link: int) -> int:
 
 
 @kernel
-def use_pair(
-    record: Any, h: int, run: Any, which: tuple[int, int, int], q: int, start: int
-) -> None:
-    """Make a reading of a pair, ``which`` = (m, r, c) with payload m, rows of an observation, from
-    row ``start`` on.
-    """
-    f, tables, pairs, (m, r, c) = record.fusion, record.tables, run.pairs, which
+def use_pair(record: Any, h: int, run: Any, what: tuple[int, int, int], q: int, start: int) -> None:
+    """Make a reading of a pair, ``what`` = (m, r, c), rows of an observation from ``start`` on."""
+    f, tables, pairs, (m, r, c) = record.fusion, record.tables, run.pairs, what
     rows, own, block = pairs.rows, pairs.own, block_of_pair(pairs, c)
     first, size, count = tables.first[h, block], tables.size[block], pairs.length[c]
     rows.x[:] = 0.0

@@ -30,8 +30,7 @@ class BlockTables(Struct):
 
 def blocks_by_key(blocks: Sequence[Place], n: int) -> dict[Key, Place]:
     """Return the blocks of a node of n states by name and owner; one of all states without any."""
-    places = blocks or (Place("", None, 0, n),)
-    return {place.key: place for place in places}
+    return {place.key: place for place in blocks or (Place("", None, 0, n),)}
 
 
 def block_numbers(infos: Sequence[Any]) -> Mapping[Key, int]:

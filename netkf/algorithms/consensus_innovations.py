@@ -49,8 +49,7 @@ CONVERGED = 1e-14
 
 
 class ConsensusGains(NamedTuple):
-    """The gains of one node in one slot; or of N nodes in K slots, with W directions by receiver
-    and sender.
+    """The gains of one node in one slot; or of N nodes in K slots, with W directions in order.
 
     B : (d, n, n) for the d nodes that it hears, in the order of their indices; or (K, W, n, n)
     M, K : (n, n), of the pseudo-observation in yhat, and of the pseudo-state in xhat; or
@@ -132,8 +131,7 @@ class GainSequence:
         """Return the table rows (count,) of ``count`` slots from number ``first`` on, and the table
         of the gains of the nodes with the indices ``places``.
 
-        Slots after convergence share one row. Slot 0 gets that of slot 1, since nothing happens in
-        it.
+        Slots after convergence share one row. Slot 0 gets that of slot 1: nothing happens in it.
         """
         slots = np.maximum(np.arange(first, first + count), 1)
         self.at(int(slots[-1]))
@@ -152,7 +150,6 @@ class GainSequence:
         return slots - slots[0], table
 
     def _predict_errors(self) -> tuple[ConsensusGains, ...]:
-        """Advance ``_errors`` by a slot."""
         nodes = range(len(self._neighbours))
         x, y = self._errors.reshape(2, len(nodes), self._n, -1)
         # Slot number k is predicted from k - 1 on.
@@ -177,7 +174,6 @@ class GainSequence:
         return self._state_error(len(self._neighbours) + i)
 
     def _correct_pseudo_states(self) -> list[tuple[FloatArray, FloatArray]]:
-        """Correct the errors of all yhat in ``_errors`` at once."""
         n, N, first = self._n, len(self._neighbours), self._errors.shape[1]
         inputs = sum(noise.shape[1] for noise in self._noises)
         self._errors = np.hstack([self._errors, np.zeros((len(self._errors), inputs))])
@@ -213,9 +209,7 @@ class GainSequence:
 
 
 def variances(errors: FloatArray) -> FloatArray:
-    """Return the variances (k,) of k ``errors`` (k, inputs), given by their coefficients of
-    independent inputs with variance 1.
-    """
+    """Return the variances (k,) of ``errors`` (k, inputs), of independent unit inputs."""
     return np.asarray(np.square(errors).sum(axis=1))
 
 
@@ -246,9 +240,7 @@ gain_sequence = cached_by_entries(8)(GainSequence)
 
 @kernel
 def predict(record: Any, h: int, run: Any) -> None:
-    """Predict the estimates of node ``h``, of the pseudo-state and of the state; the root follows
-    from the gains.
-    """
+    """Predict state and pseudo-state of node ``h``; the root follows from the gains."""
     lanes, x, y, F, inverse = run.lanes, record.xhat, record.pseudo, run.model.F, record.inverse
     # y - G x, of which G^+ is a difference of states.
     write_matvec(run, record.G, x, h, run.gains)
@@ -303,8 +295,7 @@ def absorb(record: Any, h: int, run: Any) -> None:
             for j in range(n):
                 heard = load(lanes, record.payload.pseudo, m, j)
                 total += record.B[t, w, i, j] * (heard - load(lanes, y, h, j))
-            term = select(arrived, total, 0.0)
-            store(lanes, corrected, i, load(lanes, corrected, i) + term)
+            store(lanes, corrected, i, load(lanes, corrected, i) + select(arrived, total, 0.0))
     for i in range(n):
         total = load(lanes, corrected, i)
         store(lanes, y, h, i, total)

@@ -65,9 +65,7 @@ class ClosedLoops(Struct):
 
 @kernel
 def use_sample(record: Any, h: int, run: Any) -> None:
-    """Update node ``h`` by its reading: ``x += L (y - H x)``, and P to the covariance
-    ``(I - L H) P (I - L H)' + L R L'``.
-    """
+    """Update node ``h``: ``x += L (y - H x)``, and P to ``(I - L H) P (I - L H)' + L R L'``."""
     lanes, n, r = run.lanes, len(run.size), run.reading
     first, matrix = run.first_y + r, run.first_H + run.matrix[r]
     # A node that is down, or whose gate takes nothing, has no reading, which zeros stand for.
@@ -97,9 +95,7 @@ def use_sample(record: Any, h: int, run: Any) -> None:
 
 @kernel
 def predict_closed_loop(record: Any, h: int, run: Any) -> None:
-    """Predict node ``h``: with increments the estimate moves open loop, and P by ``A - L H``, which
-    counts their noise already.
-    """
+    """Predict node ``h``: the estimate open loop, P by ``A - L H``, which counts that noise."""
     tables = record.loops.tables
     if tables.models[h] < 0:
         predict_estimate(run.model, run, record.xhat, record.root, h, h)
@@ -128,18 +124,14 @@ def use_sample_or_increments(record: Any, h: int, run: Any) -> None:
 
 @kernel
 def closed_loop_interval(record: Any, h: int, _run: Any) -> float:
-    """Return the seconds of increments for one update: 1 / |L H|, the time scale on which the gain
-    moves the estimate.
-    """
+    """Return the seconds of increments for one update: 1 / |L H|, as fast as the gain acts."""
     return usable(record.loops.rate[h])
 
 
 def constant_gain_record(
     filtering: ConstantGain, infos: Sequence[NodeInfo], models: Sequence[Any]
 ) -> Record:
-    """Return the constant matrices of all nodes: for readings, and under clocks the closed
-    loops of those with increments.
-    """
+    """Return the matrices of all nodes: for readings, and closed loops under clocks."""
     N, n = len(infos), len(models[0].information)
     gains = [filtering.gain_of(info.place) for info in infos]
     settings: dict[str, Any] = {
@@ -211,7 +203,6 @@ class ConstantGain(Filter):
         )
 
     def _check_scenario(self, scenario: Any) -> None:
-        """Raise ScenarioError where the gains do not fit a ``netkf.Scenario``."""
         for k, sensor in enumerate(scenario.sensors):
             # A node may have several rows at one instant, and a gain weighs one reading.
             if not scenario.slotted and isinstance(getattr(sensor, "path", None), SourceFile):

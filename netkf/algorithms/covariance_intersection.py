@@ -16,9 +16,7 @@ from netkf.algorithms.registry import built_in
 from netkf.algorithms.traits import Needs
 
 
-def covariance_intersection_record(
-    _: Any, infos: Sequence[NodeInfo], models: Sequence[Any]
-) -> Record:
+def intersection_record(_: Any, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
     """Return the record of the diffusion filter with ``on_loss = "keep-own"``, by which the weight
     of all that arrives decides the own one.
     """
@@ -39,10 +37,7 @@ class CovarianceIntersection(Hybrid):
 
     needs = Needs(inverts=True)
     kernels = replace(
-        DiffusionFilter.kernels,
-        record=covariance_intersection_record,
-        begin=begin_estimate,
-        unrolled=True,
+        DiffusionFilter.kernels, record=intersection_record, begin=begin_estimate, unrolled=True
     )
 
     shift = Filter.shift  # affine: the weights sum to one

@@ -95,9 +95,7 @@ def diffusion_filter_record(
     )
 
 
-def begin_diffusion_filter(
-    _: Any, node: Mapping[str, np.ndarray], info: NodeInfo, _model: Any
-) -> None:
+def begin_diffusion(_: Any, node: Mapping[str, np.ndarray], info: NodeInfo, _model: Any) -> None:
     """Set the weight of the node's own estimate when all messages arrive."""
     node["own"][...] = info.own_weight
 
@@ -132,7 +130,7 @@ class DiffusionFilter(WeightedFilter):
     )
     needs = Needs(one_way=True, inverts=True)
     kernels = Kernels(
-        emit=emit, absorb=absorb, record=diffusion_filter_record, begin=begin_diffusion_filter
+        emit=emit, absorb=absorb, record=diffusion_filter_record, begin=begin_diffusion
     )
 
     shift = Filter.shift  # affine: the weights sum to one

@@ -34,8 +34,7 @@ def emit(record: Any, h: int, m: int, run: Any) -> None:
 @kernel
 def absorb(record: Any, h: int, run: Any) -> None:
     """Use the readings heard, step 1 of Algorithm 1, or form the weighted mean of estimates, step
-    2: ``xhat_i = psi_i + sum_l c_{l,i} (psi_l - psi_i)``, so that equal estimates stay to the last
-    bit.
+    2: ``xhat_i = psi_i + sum_l c_{l,i} (psi_l - psi_i)``: equal estimates stay to the last bit.
     """
     if run.phase == READINGS:
         use_readings_heard(record, h, run)
@@ -51,9 +50,7 @@ def absorb(record: Any, h: int, run: Any) -> None:
 
 
 def diffusion_message_size(n: int, rows: int, phase: int) -> int:
-    """Return the numbers in a message: in the exchange of readings y, H and R of ``rows`` rows, in
-    that of estimates psi with n states.
-    """
+    """Return the numbers in a message: y, H, R of ``rows`` rows, or psi with n states."""
     return n if phase == ESTIMATES else rows * (1 + n) + rows * (rows + 1) // 2
 
 

@@ -36,9 +36,7 @@ from netkf.linalg.lanes import any_lane, load, load_flags, select, spread, store
 
 @kernel
 def predict(record: Any, h: int, run: Any) -> None:
-    """Predict node ``h``, and the copies of estimates as their senders do: so they stay the same at
-    both ends.
-    """
+    """Predict node ``h``, and the copies of estimates as their senders do, to stay the same."""
     predict_estimate(run.model, run, record.xhat, record.root, h, h)
     if any_lane(load_flags(run.lanes, record.has_sent, h)):
         predict_copy(run.model, run, record.sent_x, record.sent_root, h)
@@ -137,9 +135,7 @@ THRESHOLDS = tuple_of(
 def event_triggered_ci_record(
     filtering: EventTriggeredCi, _infos: Sequence[NodeInfo], models: Sequence[Any]
 ) -> Record:
-    """Return what nodes sent last, the copies of what they heard last on each link, and the
-    thresholds.
-    """
+    """Return what nodes sent last, what they heard last on each link, and the thresholds."""
     n, flag = len(models[0].information), ((), np.uint8)
     alpha, delta = filtering.thresholds
     return Record(

@@ -34,9 +34,7 @@ class Model(Protocol):
 
     @property
     def information(self) -> FloatArray:
-        """The information ``H' R^-1 H`` (n, n) that the node's sensors give, per second or per
-        slot.
-        """
+        """``H' R^-1 H`` (n, n) of the node's sensors, per second or per slot."""
 
     def predict(
         self, xhat: FloatArray, root: FloatArray, gap: float
@@ -57,14 +55,11 @@ class Model(Protocol):
         self, xhat: FloatArray, root: FloatArray, moments: FloatArray, gap: float
     ) -> FloatArray:
         """Return the estimate (n,) after the increments of the last ``gap`` seconds with these
-        ``moments`` (2 p,), from the prediction ``xhat`` (n,) and the ``root`` (n, n) at the end of
-        the gap.
+        ``moments`` (2 p,), from ``xhat`` (n,) and ``root`` (n, n) predicted to its end.
         """
 
     def max_interval(self, root: FloatArray) -> float:
-        """Return the seconds of increments that may be used at once if the covariance has this root
-        (n, n).
-        """
+        """Return the seconds of increments usable at once, for this root (n, n) of P."""
 
 
 class NetworkInfo(NamedTuple):
@@ -158,9 +153,7 @@ class Exchange(NamedTuple):
 
 
 class Message(NamedTuple):
-    """A message that arrived: its sender, the weight it is given, its payload, and its age in
-    seconds.
-    """
+    """A message that arrived: sender, weight, payload, and age in seconds."""
 
     sender: int
     weight: float
@@ -174,8 +167,7 @@ class PairReading(NamedTuple):
     other : name and owner (id) of the latter, -1 if all share it
     y, R : values (p,), and their noise covariance (p, p)
     H : ``H(x, x_other)`` returns y linearised at the estimates x (n,) of the node and x_other (n',)
-        of the other block: z (p,), and H (p, n) and H_other (p, n') with ``z = H x + H_other
-        x_other + v``
+        of the other: z (p,), and H (p, n), H_other (p, n') with ``z = H x + H_other x_other + v``
     """
 
     other: Key
@@ -225,9 +217,7 @@ class State(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """The usual payload: the sender's estimate ``xhat`` (n,) and the ``root`` (n, n) of its
-    covariance.
-    """
+    """The usual payload: the estimate ``xhat`` (n,) and the ``root`` (n, n) of its covariance."""
 
     xhat: FloatArray
     root: FloatArray
@@ -349,8 +339,7 @@ class Filter(Component):
 
     def emit(self, state: Any, exchange: Exchange) -> tuple[Any, Any]:
         """Return the state after sending and the payload for all ``exchange.receivers`` (in slots:
-        of this step); a payload of None sends nothing. By default the payload is ``xhat`` (n,) and
-        ``root`` (n, n).
+        of this step); a payload of None sends nothing. By default it is ``xhat`` and ``root``.
         """
         if self.kernels is not None:
             return single.emit(state, exchange)
@@ -366,9 +355,7 @@ class Filter(Component):
         return single.absorb(state, messages, exchange)
 
     def estimate(self, state: Any) -> tuple[FloatArray, FloatArray | None]:
-        """Return the estimate ``xhat`` (n,) and its covariance ``P`` (n, n) now; P is None if the
-        filter has none.
-        """
+        """Return ``xhat`` (n,) and its covariance ``P`` (n, n) now; P is None if there is none."""
         return state.xhat, state.root @ state.root.T
 
     def shift(self, state: Any, offset: FloatArray) -> Any:

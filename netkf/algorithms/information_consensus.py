@@ -105,11 +105,8 @@ def mix_pairs(record: Any, h: int, run: Any) -> None:
         for k in range(run.count):
             # A weight of 0 adds no information.
             if run.message_weight[k] > 0.0:
-                arrived = load_flags(lanes, run.arrived, k)
-                weight = select(arrived, run.message_weight[k], 0.0)
-                weigh_part(
-                    lanes, work, weight, payload.parts, run.message[k], p, payload.xhat, x, h
-                )
+                share = select(load_flags(lanes, run.arrived, k), run.message_weight[k], 0.0)
+                weigh_part(lanes, work, share, payload.parts, run.message[k], p, payload.xhat, x, h)
                 merge_lanes(lanes, run.size, total, work)
         copy_information_root(lanes, total, parts[h, p])
     if run.step == record.steps - 1:
@@ -143,8 +140,7 @@ def information_consensus_record(
 
 @dataclass(frozen=True, eq=False)
 class InformationConsensus(Filter):
-    """Consensus on information pairs, ``steps`` times a slot; ``recipe`` of a derived class says
-    which ones.
+    """Consensus on information pairs, ``steps`` times a slot, by ``recipe`` of derived classes.
 
     The weights are Metropolis', ``1 / (1 + max degree)`` for each link; the weight of a message
     that does not come stays with the node itself, so that weights always sum to one.
@@ -167,9 +163,7 @@ class InformationConsensus(Filter):
 
     @abstractmethod
     def recipe(self, nodes: int) -> Recipe:
-        """Return the recipe for a network of N ``nodes``: from which information pairs begin, and
-        how often each counts.
-        """
+        """Return the recipe for N ``nodes``: where pairs begin, and how often each counts."""
 
     @property
     def analysis(self) -> Analysis:
@@ -205,8 +199,7 @@ class Hcmci(InformationConsensus):
 
     def recipe(self, nodes: int) -> Recipe:
         """Return the recipe for a network of N ``nodes`` and the variant that was chosen: from
-        which shares of prediction and reading the pairs begin, and how often each counts in the
-        estimate.
+        which shares of prediction and reading the pairs begin, and how often each counts.
         """
         omega = float(nodes) if self.novelty_weight is None else self.novelty_weight
         # Rows: shares of prediction and reading in a pair; then how often each pair counts, and the
@@ -246,7 +239,6 @@ class Hcmci(InformationConsensus):
         return (*notes, f"hcmci: {rule} parts: P is overconfident; {remedy}")
 
     def _check_scenario(self, scenario: Any) -> None:
-        """Raise ScenarioError where the variant does not fit a ``netkf.Scenario``."""
         check_information(scenario)
         if not scenario.slotted and self.consensus != INFORMATION:
             raise ScenarioError(

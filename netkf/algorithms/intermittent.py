@@ -121,9 +121,7 @@ def use_and_remember(record: Any, h: int, run: Any, r: int) -> None:
 
 @kernel
 def use_late(record: Any, h: int, run: Any, k: int) -> None:
-    """Go back to the event before the reading of message ``k``, use it, and repeat all later
-    events.
-    """
+    """Go back to before the reading of message ``k``, use it, and repeat all later events."""
     r = run.heard[k]
     if run.rows[r] == 0:
         return
@@ -281,9 +279,7 @@ def intermittent_record(
     )
 
 
-def begin_intermittent(
-    _: Any, node: Mapping[str, np.ndarray], _info: NodeInfo, _model: Any
-) -> None:
+def begin_intermittent(_: Any, node: Mapping[str, np.ndarray], _info: Any, _model: Any) -> None:
     """Make the start the first event of the past: every late reading has a state before it."""
     if "kept" in node:
         node["past_x"][0], node["past_root"][0] = node["xhat"], node["root"]

@@ -62,10 +62,8 @@ def absorb(record: Any, h: int, run: Any) -> None:
         total = spread(lanes, 0.0)
         for k in range(run.count):
             arrived = load_flags(lanes, run.arrived, k)
-            difference = load(lanes, payload.xhat, run.message[k], i) - load(
-                lanes, record.prior, h, i
-            )
-            total += select(arrived, difference, 0.0)
+            offset = load(lanes, payload.xhat, run.message[k], i) - load(lanes, record.prior, h, i)
+            total += select(arrived, offset, 0.0)
         store(lanes, run.row, i, total)
     add_consensus_term(record, h, run)
 

@@ -73,16 +73,12 @@ class FlowModel:
 
     @cached_property
     def flow(self) -> FlowTable:
-        """Table from which ``flow_root`` computes the root (n, n) of P after any gap, with this
-        node's increments.
-        """
+        """Table for the root (n, n) of P after any gap, with this node's increments."""
         return shared_flow_table(self.A, self.Q, self.H, self.R, self.horizon)
 
     @cached_property
     def unobserved_flow(self) -> FlowTable:
-        """Table from which ``flow_root`` computes the root (n, n) of P after any gap, without
-        readings.
-        """
+        """Table for the root (n, n) of P after any gap, without readings."""
         nothing = np.zeros((0, len(self.A)))
         return shared_flow_table(self.A, self.Q, nothing, np.zeros((0, 0)), self.horizon)
 
@@ -110,8 +106,7 @@ class FlowModel:
     def transition(self, xhat: FloatArray, gap: float) -> FloatArray:
         """Return the derivative (n, n) of the predicted estimate with respect to ``xhat`` (n,)."""
         eye = np.eye(len(xhat))
-        columns = [self.predict(e, np.zeros_like(eye), gap)[0] for e in eye]
-        return np.stack(columns, axis=1)
+        return np.stack([self.predict(e, np.zeros_like(eye), gap)[0] for e in eye], axis=1)
 
     def gain_update(
         self, xhat: FloatArray, root: FloatArray, moments: FloatArray, gap: float
@@ -126,9 +121,7 @@ class FlowModel:
         return gain_update_root(self.gains, lower(root), as_floats(xhat), moments, gap)
 
     def max_interval(self, root: FloatArray) -> float:
-        """Return the longest measurement interval, in seconds, for a covariance with this root
-        (n, n), see ``Timing.interval``.
-        """
+        """Return the longest interval (s) for this root (n, n) of P, see ``Timing.interval``."""
         # trace(P G) = |R^-1/2 H S|^2, without forming P = S S' and G = H' R^-1 H.
         HS = self.flow.whitened_H[0] @ root
         return usable(float((HS * HS).sum()))
@@ -308,9 +301,7 @@ class ChangingFlowModel(FlowModel):
     def predict(
         self, xhat: FloatArray, root: FloatArray, gap: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the estimate (n,) and the root (n, n) as ``FlowModel.predict``, ``gap`` seconds up
-        to now.
-        """
+        """Return estimate and root as ``FlowModel.predict``, ``gap`` seconds up to now."""
         if not self.reads:
             return self.extrapolate(xhat, root, gap)
         for model, length in self._parts(gap):
@@ -320,9 +311,7 @@ class ChangingFlowModel(FlowModel):
     def extrapolate(
         self, xhat: FloatArray, root: FloatArray, age: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the estimate (n,) and the root (n, n) as ``FlowModel.extrapolate``, ``age``
-        seconds up to now.
-        """
+        """Return estimate and root as ``FlowModel.extrapolate``, ``age`` seconds up to now."""
         for model, length in self._parts(age):
             xhat, root = model.extrapolate(xhat, root, length)
         return xhat, root
@@ -373,9 +362,7 @@ class ChangingSlotModel(SlotModel):
 
 
 def changing_models(pieces: Sequence[Sequence[Any]], changes: Sequence[Any]) -> list[Any]:
-    """Return the models of nodes from those of each piece of the plant, between ``changes``, in
-    seconds or in slots.
-    """
+    """Return nodes' models from those of each piece, between ``changes``, in seconds or slots."""
     if len(pieces) == 1:
         return list(pieces[0])
     cls: Any = ChangingSlotModel if isinstance(pieces[0][0], SlotModel) else ChangingFlowModel
@@ -460,9 +447,7 @@ class RateModel(FlowModel):
         return self.predict(xhat, root, age)
 
     def transition(self, xhat: FloatArray, gap: float) -> FloatArray:
-        """Return the derivative (n, n) of the predicted estimate at ``xhat`` (n,), by central
-        differences.
-        """
+        """Return the derivative (n, n) of the prediction at ``xhat``, by central differences."""
         still, columns = np.zeros((len(xhat),) * 2), []
         for e in np.diag(DIFFERENCE * np.maximum(1.0, np.abs(xhat))):
             after, before = (self.predict(xhat + d, still, gap)[0] for d in (e, -e))
@@ -484,9 +469,7 @@ def as_floats(values: Any) -> FloatArray:
 
 
 def first_root(cov: FloatArray) -> FloatArray:
-    """Return the lower triangular S (n, n) with ``S S' = cov``, for an initial covariance ``cov``
-    (n, n), which may be singular.
-    """
+    """Return lower triangular S (n, n), ``S S' = cov``, of ``cov`` (n, n), maybe singular."""
     return lower_root(square_root(cov))
 
 
@@ -517,8 +500,7 @@ def predict_root(root: FloatArray, F: FloatArray, root_Q: FloatArray) -> FloatAr
 
 def whiten_reading(y: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the whitened reading ``L^-1 y`` (p,) and ``L^-1 H`` (p, n) of a reading y (p,) with H
-    (p, n) and noise covariance ``R = L L'`` (p, p), so that the noise of its rows is white with
-    variance 1.
+    (p, n) and noise covariance ``R = L L'`` (p, p), so that the noise of its rows is white.
     """
     # One solve for y and H together.
     whitened = np.linalg.solve(np.linalg.cholesky(as_floats(R)), np.column_stack([y, H]))

@@ -45,9 +45,7 @@ class ModeSplit(NamedTuple):
 
 
 def slot_rates(F: FloatArray) -> FloatArray:
-    """Return the growth log |lambda| per slot (n,) of the modes of F (n, n), finite also where F is
-    singular.
-    """
+    """Return the growth log |lambda| per slot (n,) of F's modes, finite also of a singular F."""
     tiny = np.finfo(float).tiny
     return np.asarray(np.log(np.maximum(np.abs(np.linalg.eigvals(F)), tiny)))
 
@@ -97,8 +95,7 @@ class ModeFrame:
     transition D(t) of the modes that do not grow. The entries of e that belong to these are
     constant, and the first ``growing`` ones grow.
 
-    So information about e is never pulled back through a transition that decays, and a singular F
-    is no exception.
+    So information about e is never pulled back through what decays, a singular F included.
 
     basis, inverse : (n, n)
     growing        : number of the modes that grow

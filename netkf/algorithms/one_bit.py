@@ -44,9 +44,7 @@ def has_read(run: Any, r: int) -> bool:
 
 @kernel
 def emit_bits(record: Any, h: int, m: int, run: Any) -> None:
-    """Send, in the turn of node ``h``, the signs of the innovations of its reading, +1 or -1, and
-    correct the node by them.
-    """
+    """Send the signs, +1 or -1, of the innovations of node ``h``, and correct it by them."""
     lanes, r, asked = run.lanes, run.reading, load_flags(run.lanes, run.sends)
     # One node a slot: its bits refer to an estimate that all nodes share.
     if run.slot % record.nodes != int(record.turn[h, 0]) or not has_read(run, r):
@@ -128,8 +126,7 @@ class OneBit(Filter):
     for the sign b of a row h of H with noise variance r.
 
     It is the paper's filter if all nodes receive all bits. A node that misses some continues with
-    another estimate, to which later bits do not refer. Readings enter as bits only, also the
-    node's own.
+    another estimate, to which later bits do not refer. Own readings enter as bits too.
     """
 
     analysis = Analysis(paper="one_bit", payload_numbers=lambda _, rows, __: rows / 64.0)

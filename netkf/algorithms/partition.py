@@ -8,8 +8,7 @@ weights that sum to one
     P_a' = sum_b (1 / weight_b) A_ab P_b A_ab' + Q_a
 
 is a bound again, with b = a among them. The weights here are those with the least trace, in
-proportion to the root of the trace of ``A_ab P_b A_ab'``: without coupling it is the prediction of
-a Kalman filter.
+proportion to the root of the trace of ``A_ab P_b A_ab'``; without coupling it is a Kalman filter's.
 
 A node keeps the whole state, its own blocks first. Its *groups* are its own blocks, and then all
 blocks of each other owner; nothing is known of how errors of two groups correlate.
@@ -183,8 +182,7 @@ def add_term(
 @kernel
 def bound_after(record: Any, groups: Groups, k: int, g: int, P: FloatArray) -> None:
     """Write into the entries of ``P`` of group ``g`` of number ``k`` of ``groups`` the bound of its
-    covariance that has the least trace, after a move by ``Phi_now`` with the noise ``Q_now`` from
-    ``bounds_now``.
+    covariance of least trace, after a move by ``Phi_now`` with ``Q_now`` from ``bounds_now``.
     """
     sizes, total, own = record.sizes, 0.0, groups.member[k]
     for other in range(groups.count[k]):
@@ -367,9 +365,7 @@ def update(record: Any, h: int, run: Any) -> None:
 
 @kernel
 def group_of_row(run: Any, matrix: int, c: int, q: int, group: np.ndarray) -> int:
-    """Return the other group that row ``c`` of a reading depends on, 0 for none, -1 if it says
-    nothing.
-    """
+    """Return the other group on which row ``c`` depends, 0 for none, -1 if it says nothing."""
     found = -1
     for i in range(len(group)):
         if run.H[matrix, c, i, q] != 0.0:
@@ -466,9 +462,7 @@ def hear(record: Any, h: int, run: Any, k: int, q: int, end: int) -> None:
 
 @kernel
 def replace_group(record: Any, size: int, heard: float, q: int, end: int) -> None:
-    """Replace what is known of the group taken by what was told of all of it, with the trace
-    ``heard``, if that is less.
-    """
+    """Replace what is known of the group by what was told, if its trace ``heard`` is less."""
     at, before = record.at, 0.0
     for i in range(size):
         before += record.now_P[at[i], at[i]]
@@ -506,9 +500,7 @@ def shift(record: Any, h: int, run: Any) -> None:
     shift_vector(run, record.start_x, h)
 
 
-def partition_record(
-    _filtering: Partition, infos: Sequence[NodeInfo], models: Sequence[Any]
-) -> Record:
+def partition_record(_: Any, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
     """Return the record. A node keeps, besides the estimates of all groups now, what it last used:
     ``x`` (N,), predicted to now, and the ``bounds`` (N, N) of that time, 0 between groups, with
     ``Phi`` and ``Q`` of the time since; and what is known of the start, predicted to now.

@@ -90,8 +90,7 @@ both results are one covariance and not rounding errors.
 def predict(record: Any, h: int, run: Any) -> None:
     """Step 3. With asymptotic gains the covariance is P_inf, and only the mean is predicted."""
     if record.asymptotic == 1:
-        F = run.model.F
-        transform_mean(run.lanes, run.size, record.xhat, h, F, run.moved_mean)
+        transform_mean(run.lanes, run.size, record.xhat, h, run.model.F, run.moved_mean)
     else:
         predict_estimate(run.model, run, record.xhat, record.root, h, h)
 
@@ -123,9 +122,7 @@ def emit(record: Any, h: int, m: int, run: Any) -> None:
 
 @kernel
 def absorb(record: Any, h: int, run: Any) -> None:
-    """Average estimates, step 5.2, or take in mass and learn from it what the network is, steps 2.2
-    and 2.3.
-    """
+    """Average estimates, step 5.2, or take in mass and learn the network from it, 2.2, 2.3."""
     if run.phase == AVERAGE:
         average(record, h, run)
     elif record.asymptotic == 0:
@@ -182,9 +179,7 @@ def mix_mass(record: Any, h: int, run: Any) -> None:
 
 @kernel
 def receive_totals(record: Any, h: int, run: Any) -> None:
-    """Add the growth of the totals that arrive, which replace the last ones heard, to the mass of
-    node h.
-    """
+    """Add the growth of totals, which replace the last ones heard, to the mass of node h."""
     lanes, mass, heard = run.lanes, record.mass, record.heard
     for i in range(mass.shape[1]):
         total = spread(lanes, 0.0)
@@ -229,10 +224,8 @@ def learn_network(record: Any, h: int, run: Any) -> None:
     frozen = load_flags(lanes, record.silent)
     for i in range(n):
         for j in range(n):
-            former = load(lanes, record.information, h, i, j)
-            store(
-                lanes, record.information, h, i, j, select(frozen, former, load(lanes, new, i, j))
-            )
+            last = load(lanes, record.information, h, i, j)
+            store(lanes, record.information, h, i, j, select(frozen, last, load(lanes, new, i, j)))
     store(lanes, record.number, h, select(frozen, load(lanes, record.number, h), number))
 
 
@@ -602,7 +595,6 @@ class PushSum(Filter):
         )
 
     def _check_scenario(self, scenario: Any) -> None:
-        """Raise ScenarioError where the settings do not fit a ``netkf.Scenario`` in slots."""
         if not scenario.slotted:
             return
         nodes = scenario.nodes
@@ -652,7 +644,6 @@ class PushSum(Filter):
             )
 
     def _scenario_notes(self, scenario: Any) -> tuple[str, ...]:
-        """Return notes on delta, on rounding, and on settings that clocks do not use."""
         if not scenario.slotted:
             fields = dataclasses.fields(self)
             changed_settings = [
@@ -703,8 +694,7 @@ def _correct_one(
 
 def asymptotic_root(F: FloatArray, Q: FloatArray, information: FloatArray) -> FloatArray | None:
     """Return the root of P_inf (n, n), paper P (12): the steady covariance of a filter with F and Q
-    (n, n) that has all the ``information`` (n, n) in each slot, after its reading; None if there is
-    none.
+    (n, n) that has all the ``information`` (n, n) in each slot, after its reading, or None.
     """
     P = _steady_prediction(F, Q, information)
     # Without a steady state P doubles until rounding of G stops it, at a P made of rounding errors,

@@ -75,9 +75,7 @@ class PythonPairs:
         self._kept = {number: one for part in kept for number, one in part.items()}
 
     def keep(self, kept: Kept, numbers: Sequence[int]) -> Kept:
-        """Return those that were ``kept`` and those of the last ``take`` of the node's own, if
-        their numbers are among these.
-        """
+        """Return those ``kept`` and those of the last ``take`` own ones that are numbered there."""
         first = self._first_number(kept)
         taken = {first + k * self._info.nodes: one for k, one in enumerate(self._found)}
         return {number: one for number, one in {**kept, **taken}.items() if number in numbers}

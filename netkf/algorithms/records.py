@@ -96,9 +96,7 @@ def _is_shape(shape: Any) -> bool:
 
 
 def triangle_numbers(n: int, *count: int) -> IntArray:
-    """Return the numbers of a lower triangular matrix (n, n), or of ``count`` roots (n, n + 1) of
-    information.
-    """
+    """Return numbers of a lower triangle (n, n), or ``count`` roots (n, n + 1) of information."""
     sent = np.ones((*count, n, n + len(count)), dtype=bool)
     sent[..., :n] = np.tri(n, dtype=bool)
     return np.where(sent, np.cumsum(sent).reshape(sent.shape) - 1, -1)
@@ -194,7 +192,6 @@ class Kernels:
     depends_on_data: bool | None = None
 
     def __post_init__(self) -> None:
-        """Raise TypeError for a verb that is no kernel, or takes other arguments."""
         for name in VERBS:
             verb, due = getattr(self, name), getattr(type(self), name)
             if verb is due:
@@ -313,9 +310,7 @@ class Records:
         self.begin(h, node)
 
     def copied(self) -> Any:
-        """Return the struct of the first block with its own copies of the arrays of nodes and
-        links.
-        """
+        """Return the struct of the first block with its own arrays of nodes and links."""
         struct, cls = self.struct, type(self.struct)
         fields = {name: getattr(struct, name) for name in cls.struct_fields}
         return cls(**fields | {name: array[0].copy() for name, array in self.arrays.items()})

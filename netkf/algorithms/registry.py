@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import pkgutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import cache
 from typing import Any, TypeVar
 
@@ -39,24 +39,14 @@ def built_in(kind: str, **choice: str) -> Callable[[F], F]:
     """
 
     def register(cls: F) -> F:
-        """Register the class and return it unchanged."""
-        _REGISTERED[choice_name(kind, choice)] = cls
+        _REGISTERED[" ".join([kind, *(f"{key}={value}" for key, value in choice.items())])] = cls
         return cls
 
     return register
 
 
-def choice_name(kind: str, choice: Mapping[str, str]) -> str:
-    """Return the name of a filter class: its ``kind``, and ``kind key=value`` for a ``choice`` of
-    key and value where several classes share the kind.
-    """
-    return " ".join([kind, *(f"{key}={value}" for key, value in choice.items())])
-
-
 def split_choice(name: str) -> tuple[str, dict[str, str]]:
-    """Return the kind of a filter and its choice of keys and values, from a name as ``choice_name``
-    makes it.
-    """
+    """Return the kind of a filter and its choice of keys and values, from its name."""
     kind, *choice = name.split(" ")
     return kind, dict(one.split("=", 1) for one in choice)
 
@@ -72,9 +62,7 @@ def built_in_filters() -> dict[str, type[Filter]]:
 
 
 def default_timing(cls: Any) -> Timing | None:
-    """Return the timing of a filter class with its default settings; None if it depends on settings
-    without a default.
-    """
+    """Return the default timing of a filter class; None if a setting has no default."""
     if cls.timing is Filter.timing:
         return Timing()
     try:
@@ -85,9 +73,7 @@ def default_timing(cls: Any) -> Timing | None:
 
 
 def built_in_class(algorithm: object) -> type[Filter] | None:
-    """Return the built-in class of the filter ``algorithm``, or the nearest from which its class
-    derives; None if there is none.
-    """
+    """Return the built-in class of a filter, or the nearest of its bases; None without one."""
     classes = set(built_in_filters().values())
     return next((cls for cls in type(algorithm).__mro__ if cls in classes), None)
 

@@ -122,8 +122,7 @@ def weights(state: Any) -> dict[str, list[float]]:
     """Return as "weight" terms whose sum over all nodes is N, so that a run can report its drift:
     the node's weight, plus the total that it sent to each receiver, less the totals it heard.
     """
-    receivers = int(state.record.receivers[0])
-    sent = [float(state.sent[0])] * receivers
+    sent = [float(state.sent[0])] * int(state.record.receivers[0])
     return {"weight": [float(state.weight), *sent, *(-state.heard[:, 0]).tolist()]}
 
 

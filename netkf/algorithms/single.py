@@ -77,7 +77,6 @@ class Payload:
 
     @property
     def _fields(self) -> tuple[str, ...]:
-        """The names of all fields, as of a NamedTuple."""
         return (*self.fields, "reading")
 
     @property
@@ -115,12 +114,9 @@ class Payload:
         return Payload(self.fields, reading, self.sender)
 
     def _replace(self, **fields: Any) -> Payload:
-        """Return a payload with other values of some fields, as of a NamedTuple."""
         arrays = {
-            name: np.array(_as_read(name, value), self.fields[name].dtype, order="C")[
-                None, ..., None
-            ]
-            for name, value in fields.items()
+            name: np.array(_as_read(name, v), self.fields[name].dtype, order="C")[None, ..., None]
+            for name, v in fields.items()
         }
         return Payload({**self.fields, **arrays}, self.reading, self.sender)
 
@@ -152,11 +148,9 @@ class NodeState:
 
     @property
     def _fields(self) -> tuple[str, ...]:
-        """The names of all fields, as of a NamedTuple."""
         return (*self.changing, "reading")
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return what pickle needs to make the state again."""
         run, values = self.run, {name: getattr(self.record, name) for name in self.changing}
         return _restored, (run.filtering, run.model, run.info, values, self.reading, self.held)
 
@@ -166,7 +160,6 @@ class NodeState:
         return self.run.model
 
     def _replace(self, **fields: Any) -> NodeState:
-        """Return a state with other values of some fields, as of a NamedTuple."""
         new = self.copied()
         for name, value in fields.items():
             getattr(new, name)[...] = _as_read(name, value)
@@ -268,16 +261,11 @@ class Surroundings:
             run.rows[k] = len(H) if rows is None else rows
 
     def set_inbox(self, own: Any, messages: Sequence[Any], slotted: bool) -> None:
-        """Make these messages the inbox of the run; their readings are numbered after the
-        ``own``, whitened or None.
-        """
+        """Make these messages the inbox; readings are numbered after the ``own`` one, if any."""
         run, count = self.struct, len(messages)
         if count > len(run.message):
-            run.message, run.age, run.message_weight = (
-                np.arange(count),
-                np.zeros(count),
-                np.ones(count),
-            )
+            run.message, run.age = np.arange(count), np.zeros(count)
+            run.message_weight = np.ones(count)
             run.link, run.heard = (np.zeros(count, dtype=np.int64) for _ in range(2))
             run.arrived = np.ones((count, 1), dtype=np.uint8)
         run.count = count
@@ -316,13 +304,6 @@ class Surroundings:
         """Let the filter set what it knows of a slot before the run."""
         if slot >= 0:
             self._prepare(self.filtering, record, [self.info], [self.model], slot, 1)
-
-    def set_time(self, time: float) -> None:
-        """Set the time in seconds of a reading, nan if that is not known."""
-        if self.clocked:
-            self.struct.now = time
-        elif math.isfinite(time):
-            self.struct.slot = round(time / self.period)
 
     def set_exchange(self, exchange: Any) -> None:
         """Set the circumstances of ``emit`` or ``absorb``."""
@@ -383,7 +364,6 @@ def begin_node(
 def _restored(
     filtering: Any, model: Any, info: Any, values: dict[str, Any], reading: Any, held: Kept
 ) -> Any:
-    """Return a state that was pickled."""
     n = values["xhat"].shape[1]
     state = begin_node(filtering, model, np.zeros(n), np.eye(n), info)
     for name, array in values.items():
@@ -427,7 +407,10 @@ def update(state: NodeState, reading: Any) -> NodeState:
     whitened = whitened._replace(pairs=reading.pairs)
     # In slots a node without a sensor gets readings without rows.
     surroundings.set_readings([whitened], kept=state.held)
-    surroundings.set_time(reading.time)
+    if surroundings.clocked:
+        surroundings.struct.now = reading.time
+    elif math.isfinite(reading.time):
+        surroundings.struct.slot = round(reading.time / surroundings.period)
     call_kernel(state.kernels.update, new.record, 0, run=run)
     surroundings.keep_pairs(new)
     new.reading = whitened if len(whitened.y) or whitened.pairs else None

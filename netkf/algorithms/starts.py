@@ -49,9 +49,7 @@ def _information_condition(scenario: Any) -> float:
     if not scenario.slotted or not scenario.plant.linear:
         return 1.0
     try:
-        pairs = [
-            scenario.observation_matrices(node, believed=True) for node in scenario.sensing_nodes
-        ]
+        pairs = [scenario.observation_matrices(i, believed=True) for i in scenario.sensing_nodes]
     except TheoryError:
         return 1.0
     n = scenario.plant.n

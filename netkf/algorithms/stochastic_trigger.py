@@ -47,9 +47,7 @@ from netkf.linalg.lanes import any_lane, load, load_flags, select, spread, store
 
 
 def trigger_matrix(Y: float | FloatArray, rows: int) -> FloatArray:
-    """Return Y (p, p) for a reading of p ``rows``; a number stands for that multiple of the
-    identity.
-    """
+    """Return Y (p, p) for a reading of p ``rows``; a number stands for a multiple of I."""
     return np.asarray(Y if isinstance(Y, np.ndarray) else Y * np.eye(rows))
 
 
@@ -98,9 +96,7 @@ def predict_prior(record: Any, h: int, run: Any) -> None:
 
 @kernel
 def emit_reading(record: Any, h: int, m: int, run: Any) -> None:
-    """Send the reading of node ``h`` with probability 1 - exp(-z' Y z / 2), and with it the rows by
-    which later silence counts.
-    """
+    """Send the reading with probability 1 - exp(-z' Y z / 2), and the rows of later silence."""
     lanes, rows, matrix = run.lanes, run.rows[run.reading], run.first_H + run.matrix[run.reading]
     for k in range(rows):
         for i in range(len(run.size)):
@@ -140,9 +136,7 @@ def use_silence(record: Any, h: int, run: Any, rows: FloatArray, k: int, silent:
 
 @kernel
 def absorb_readings(record: Any, h: int, run: Any) -> None:
-    """Use the readings that were sent, the own one too, and the silence of all other sensors that
-    node ``h`` knows.
-    """
+    """Use the readings sent, the own one, and the silence of all other sensors that ``h`` knows."""
     lanes, payload = run.lanes, record.payload
     # The own reading counts only if it was sent: else all nodes would not hold one estimate.
     sent = load_flags(lanes, record.sent, h)
@@ -176,9 +170,7 @@ def absorb_readings(record: Any, h: int, run: Any) -> None:
 def scheduled_readings_record(
     filtering: ScheduledReadings, infos: Sequence[NodeInfo], models: Sequence[Any]
 ) -> Record:
-    """Return predictions, what was sent, and the sensors that nodes know: their own, and those
-    of the senders of each link.
-    """
+    """Return predictions, what was sent, and the sensors known: own, and of each link's sender."""
     n, p = len(models[0].information), infos[0].rows
     trigger = whitened_triggers(models, p, filtering.Y)
     flag = ((), np.uint8)
@@ -194,9 +186,7 @@ def scheduled_readings_record(
     )
 
 
-def begin_scheduled_readings(
-    _: Any, node: Mapping[str, np.ndarray], _info: NodeInfo, _model: Any
-) -> None:
+def begin_scheduled(_: Any, node: Mapping[str, np.ndarray], _info: NodeInfo, _model: Any) -> None:
     """Take the first estimate for a prediction."""
     node["prior"][:] = node["xhat"]
 
@@ -206,8 +196,7 @@ class ScheduledReadings(Filter):
     """Every node broadcasts its reading y or is silent, and its receivers use the silence, too.
 
     Silence is as informative as a reading ``H xbar`` with noise ``R + Y^-1``. A node uses its own
-    reading like its receivers, only if it is sent, so that all have one estimate; the first is
-    always sent.
+    reading like its receivers, only if it is sent: all have one estimate. The first is sent.
     """
 
     Y: float | FloatArray
@@ -234,7 +223,7 @@ class ScheduledReadings(Filter):
         sends_readings=True,
         decides=True,
         record=scheduled_readings_record,
-        begin=begin_scheduled_readings,
+        begin=begin_scheduled,
     )
 
     shift = Filter.shift  # innovations do not depend on the origin
@@ -244,9 +233,7 @@ F = TypeVar("F", bound=type[Filter])
 
 
 def forwarding(cls: F) -> F:
-    """Make all that a filter says of itself, but for what ``cls`` defines, what the filter
-    ``wrapped`` says.
-    """
+    """Let a filter say of itself, but for what ``cls`` defines, what ``wrapped`` says."""
     for name in vars(Filter).keys() - vars(cls).keys():
         if not name.startswith("_"):
             setattr(cls, name, _forwarded(name, vars(Filter)[name]))
@@ -411,16 +398,12 @@ class TriggeredMessages(Filter):
 
     @property
     def kernels(self) -> Kernels | None:  # type: ignore[override]
-        """The kernels of the wrapped filter with those of the trigger; None where it is one in
-        plain Python.
-        """
+        """The kernels of the wrapped filter with the trigger; None for one in plain Python."""
         inner = compiled_kernels(self.inner, clocked=False)
         return None if inner is None else with_trigger(inner)
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> WrappedState:
-        """Return the state of the wrapped filter at time 0 from ``mean`` (n,) and ``cov`` (n, n),
-        without a decision yet.
-        """
+        """Return the wrapped filter's state from ``mean`` (n,) and ``cov`` (n, n), undecided."""
         return WrappedState(self.inner.init(model, mean, cov, node))
 
     def predict(self, state: WrappedState, gap: float) -> WrappedState:
@@ -447,8 +430,7 @@ class TriggeredMessages(Filter):
         if silent is None:
             # After its first reading a node always sends.
             silent = state.has_sent and exchange.uniform < silence_probability(state.news)
-            has_sent = state.has_sent or state.news >= 0.0
-            state = state._replace(silent=silent, has_sent=has_sent)
+            state = state._replace(silent=silent, has_sent=state.has_sent or state.news >= 0.0)
         # The wrapped filter's state changes as if it had sent: silence is a lost message.
         inner, payload = self.inner.emit(state.inner, exchange)
         return state._replace(inner=inner), None if silent else payload
@@ -465,8 +447,7 @@ class TriggeredMessages(Filter):
 
     def shift(self, state: Any, offset: FloatArray) -> Any:
         """Return the state, or a payload, with ``offset`` (n,) added to the wrapped filter's
-        estimate, for a move of the origin: innovations do not change, and so the trigger's news
-        neither.
+        estimate, for a move of the origin: innovations, and the trigger's news, do not change.
         """
         if not isinstance(state, WrappedState):
             return self.inner.shift(state, offset)
@@ -495,9 +476,7 @@ class StochasticTrigger(Filter):
 
     @cached_property
     def wrapped(self) -> Filter:
-        """The filter that runs: one that uses silence if ``inner`` is "intermittent", else
-        ``inner`` with a trigger.
-        """
+        """The filter that runs: ``inner`` with a trigger, or one that uses silence."""
         if type(self.inner) is Intermittent:
             return ScheduledReadings(self.Y)
         return TriggeredMessages(self.Y, self.inner)
@@ -518,7 +497,6 @@ class StochasticTrigger(Filter):
         return replace(self.wrapped.analysis, wrapped=self.wrapped)
 
     def _check_scenario(self, scenario: Any) -> None:
-        """Raise ScenarioError where the inner filter or Y does not fit a ``netkf.Scenario``."""
         inner = self.inner
         if (
             inner.analysis.wrapped is not None

@@ -89,9 +89,7 @@ def copy_track(
             root[i, j] = roots[h, i, j, q]
 
 
-def pair_fusion_record(
-    filtering: PairFusion, _infos: Sequence[NodeInfo], models: Sequence[Any]
-) -> Record:
+def pair_fusion_record(filtering: PairFusion, _infos: Any, models: Sequence[Any]) -> Record:
     """Return the rule, and scratch for one fusion at a time."""
     n = len(models[0].information)
     scratch = {"work": (2 * n + 2, n), "x": (n,), "S": (n, n), "other_x": (n,)}
@@ -291,9 +289,7 @@ def bar_shalom_campo_record(_: Any, infos: Sequence[NodeInfo], models: Sequence[
     )
 
 
-def begin_bar_shalom_campo(
-    _: Any, node: Mapping[str, np.ndarray], _info: NodeInfo, _model: Any
-) -> None:
+def begin_bar_shalom_campo(_: Any, node: Mapping[str, np.ndarray], _info: Any, _model: Any) -> None:
     """Begin the track with the first estimate, and keep its covariance."""
     node["track_x"][:], node["track_root"][:] = node["xhat"], node["root"]
     node["start"][:] = node["root"] @ node["root"].T
@@ -377,8 +373,7 @@ def best_combination(
     joint: FloatArray, tracks: Sequence[int], own_root: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the optimal gain (n, k n) of the differences of k tracks to the own one, and the lower
-    triangular root (n, n) of the covariance of the combination: ``own_root`` (n, n) if all tracks
-    are the same.
+    triangular root (n, n) of its covariance: ``own_root`` (n, n) if all tracks are the same.
 
     ``joint`` (m, m, n, n) is the joint covariance of the errors of all tracks; ``tracks`` are the
     indices of the own one and of the k others.

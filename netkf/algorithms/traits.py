@@ -103,9 +103,7 @@ class Weights:
 
 
 def estimate_numbers(n: int, _rows: int, _phase: int) -> float:
-    """Return the size of an estimate of n states with its covariance, of which one triangle
-    counts.
-    """
+    """Return the size of an estimate of n states with one triangle of its covariance."""
     return n + n * (n + 1) // 2
 
 

@@ -58,6 +58,5 @@ def state_before(model: Any, x: FloatArray, age: float) -> FloatArray:
         excess = model.extrapolate(earlier, nothing, age)[0] - x
         if age <= 0.0 or np.abs(excess).max() <= 1e-14 * np.abs(x).max():
             break
-        step = np.linalg.lstsq(model.transition(earlier, age), excess, rcond=0.0)[0]
-        earlier = earlier - step
+        earlier = earlier - np.linalg.lstsq(model.transition(earlier, age), excess, rcond=0.0)[0]
     return earlier

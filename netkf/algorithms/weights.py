@@ -48,7 +48,6 @@ class WeightedFilter(Filter):
     )
 
     def __post_init__(self) -> None:
-        """Raise ScenarioError if a weight is negative or a column does not sum to 1."""
         super().__post_init__()
         if not isinstance(self.weights, str):
             _check_columns(self.weights)

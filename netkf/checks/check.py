@@ -277,7 +277,7 @@ def judge_replicas(
     records = judge(record_promises(audits), audits, assumptions=[], runs=len(replicas), level=1.0)
     make_verdict = partial(Verdict, scenario.name, len(replicas), seed, confidence)
     try:
-        _require_covariances(scenario, replicas)
+        _require_covariances(replicas)
     except TheoryError:
         if all(row.verdict != BROKEN for row in records):
             raise
@@ -289,9 +289,7 @@ def judge_replicas(
     stacked = stack_summaries([result.summary for result in replicas if result.summary is not None])
     judged = scenario_of_view(scenario) if have_one_view(scenario) else scenario
     promised = with_promised_filter(judged)
-    parts = stack_parts(
-        scenario, seed, [result.parts for result in replicas if result.parts is not None]
-    )
+    parts = stack_parts(scenario, seed, [r.parts for r in replicas if r.parts is not None])
     # The promises of the paper and the tests of the scenario's parts may each err with half of the
     # error probability.
     rows = judge(
@@ -345,15 +343,13 @@ def _judge_base(scenario: Scenario, results: list[ReplicaResult]) -> list[Eviden
 
 
 def _transposes(scenario: Scenario) -> bool:
-    own, base = (
-        chosen.node_filter.link_weights.matrix for chosen in (scenario, with_base_filter(scenario))
-    )
+    own, base = (s.node_filter.link_weights.matrix for s in (scenario, with_base_filter(scenario)))
     if own is None or base is None or np.array_equal(own, base):
         return False
     return np.array_equal(own, np.transpose(base))
 
 
-def _require_covariances(scenario: Scenario, results: list[ReplicaResult]) -> None:
+def _require_covariances(results: list[ReplicaResult]) -> None:
     summaries = [result.summary for result in results if result.summary is not None]
     diverged = len(results) - len(summaries)
     # A class that diverges where its base does not breaks a promise; a built-in one says nothing.
@@ -391,8 +387,7 @@ def check(
 
     The state is sampled at the times that the promises need, whatever ``probe`` says. A user's
     class is held to the promises of the filter that it derives from. ``workers``, ``executor``,
-    ``scheduler`` and ``progress`` are those of ``netkf.monte_carlo``; they do not change the
-    verdict.
+    ``scheduler`` and ``progress`` are those of ``netkf.monte_carlo``, whatever the verdict.
 
     With ``until = "decided"`` runs are added until every row is decided, a promise is broken or
     ``most`` runs are done. Runs can also be added to an ``earlier`` verdict on the same scenario

@@ -202,8 +202,7 @@ def judge(
 
 def fold_followers(rows: Sequence[Evidence]) -> list[Evidence]:
     """Return the ``rows`` of a verdict with one broken row for each mistake: the first of its
-    group, unless that relies on another with a broken row (FOLLOWS). Others say from which row they
-    follow.
+    group, unless that relies on another with a broken row (FOLLOWS). Others name what they follow.
     """
     first: dict[str, Evidence] = {}
     for row in rows:

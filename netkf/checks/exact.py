@@ -161,14 +161,12 @@ def max_replayed(scenario: Scenario) -> int:
     return max(MIN_REPLAYED, min(MAX_REPLAYED, needed, affordable))
 
 
-def _pool_times(
-    e: FloatArray, covariance: FloatArray, floor: float
-) -> tuple[FloatArray, FloatArray]:
+def _pool_times(e: FloatArray, Sigma: FloatArray, floor: float) -> tuple[FloatArray, FloatArray]:
     size, n = e[0].size, e.shape[-1]
     # Variances may differ by orders of magnitude between times: each time is scaled to size 1.
-    scale = np.repeat(np.sqrt(np.diagonal(covariance).reshape(-1, size).max(axis=1)), size)
+    scale = np.repeat(np.sqrt(np.diagonal(Sigma).reshape(-1, size).max(axis=1)), size)
     scale = np.where(scale > 0.0, scale, 1.0)
-    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    values, vectors = np.linalg.eigh(Sigma / np.outer(scale, scale))
     varying = (values > MIN_VARIANCE * values[-1]) & (values > floor / scale.min() ** 2)
     whitening = (vectors / np.sqrt(np.where(varying, values, np.inf))).T / scale
     z = whitening @ e.reshape(-1)
@@ -194,10 +192,8 @@ def _pool_nees(e: FloatArray, P: FloatArray, law: ErrorLaw) -> FloatArray:
     nees = np.einsum("kia,kia->ki", e, np.linalg.solve(P, e[..., None])[..., 0])
     total = (scales * nees.ravel()).sum()
     L = np.sqrt(scales)[:, None, None] * L
-    quadratic_form = np.einsum("iab,ibjc,jdc->iajd", L, blocks, L, optimize=True).reshape(
-        e.size, e.size
-    )
-    return np.append(total, np.maximum(np.linalg.eigvalsh(quadratic_form), 0.0))
+    form = np.einsum("iab,ibjc,jdc->iajd", L, blocks, L, optimize=True).reshape(e.size, e.size)
+    return np.append(total, np.maximum(np.linalg.eigvalsh(form), 0.0))
 
 
 def _nearly_singular(P: FloatArray) -> np.ndarray:
@@ -333,8 +329,7 @@ def check_error_covariance(samples: RunSamples, level: float) -> Finding:
     labels = [*samples.point_labels, *(f"{time}, all nodes" for time in samples.time_labels)]
     # Half of the level for the points, half for all of them pooled, which is far more sensitive.
     finding = compare_chi_square(ratios, freedom.tolist(), labels, level / 2.0, "e' Sigma^-1 e")
-    pooled = _compare_pooled(runs.joint[:max_runs], level / 2.0)
-    finding = pool(finding, pooled, EVERYTHING)
+    finding = pool(finding, _compare_pooled(runs.joint[:max_runs], level / 2.0), EVERYTHING)
     return finding._replace(message=finding.message + samples.blurred_note, most_runs=max_runs)
 
 
@@ -347,9 +342,7 @@ def _compare_pooled(joint: FloatArray, level: float) -> Interval:
 
 @error_test
 def check_bias(samples: RunSamples, level: float) -> Finding:
-    """Test that errors less their mean have no constant bias, by generalised least squares from
-    ``runs.bias`` (R, n, n + 1).
-    """
+    """Test that errors have no constant bias, by least squares from ``runs.bias`` (R, n, n + 1)."""
     # Only these runs have exact covariances.
     max_runs = max_replayed(samples.scenario)
     bias, Sigma = samples.runs.bias[:max_runs], samples.runs.Sigma[:max_runs]

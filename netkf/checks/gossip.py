@@ -26,8 +26,8 @@ from netkf.checks.mode_sequences import (
     Reference,
     SwitchedReference,
     check_bounded,
-    check_initial_condition,
     check_law,
+    check_start,
     gossip_modes,
     initial_roots,
     pair_sources,
@@ -128,8 +128,7 @@ def _count_moves(scenario: Scenario, sources: np.ndarray) -> np.ndarray:
 class GossipSamples(SwitchedReference):
     """Adds simulations of the switched chain of paper G (20): the node that holds one pair
     (estimate, covariance) is a Markov chain with transition matrix Abar (the mean matching: entry
-    (i, j) is the probability that i gets j's pair in a slot), and that node's reading updates the
-    covariance.
+    (i, j) is the probability that i gets j's pair in a slot), and then uses that node's reading.
     """
 
     @cached_property
@@ -197,7 +196,7 @@ def _walks_bound(samples: GossipSamples, level: float) -> Finding:
     return compare_points(samples, shortfall, limits, message)
 
 
-def _tokens_move(samples: GossipSamples, level: float) -> Finding:
+def _move(samples: GossipSamples, level: float) -> Finding:
     i, j = _pairs_to_count(samples.scenario)
     trials, totals = int(np.sum(samples.runs.slots)), samples.runs.moves.sum(axis=0)
     nodes = samples.scenario.nodes
@@ -262,10 +261,8 @@ def _check_tokens(samples: GossipSamples, level: float) -> Finding:
     last, pairs = len(check_slots(samples.scenario)) - 1, []
     chain, origin = samples.reference.P[0, last], samples.reference.first
     for i, node in enumerate(samples.nodes):
-        token_covariances = samples.runs.tokens[:, i]
-        pairs.append(Pair(f"token {node}", token_covariances, chain, chain[origin == i]))
-    finding = compare_laws(pairs, level, samples.first_trace)
-    return samples.with_horizon(finding, _token_memory)
+        pairs.append(Pair(f"token {node}", samples.runs.tokens[:, i], chain, chain[origin == i]))
+    return samples.with_horizon(compare_laws(pairs, level, samples.first_trace), _token_memory)
 
 
 # What promises need: parts of names or sources in the table of assumptions, see ``Promise.needs``.
@@ -289,10 +286,7 @@ PROMISES = (
         exact=True,
     ),
     Promise(
-        "tokens are Markov chains with transition matrix Abar",
-        "G Proposition 6",
-        CHAIN,
-        _tokens_move,
+        "tokens are Markov chains with transition matrix Abar", "G Proposition 6", CHAIN, _move
     ),
     Promise(
         "a random sensor has the law of the switched chain, at every time",
@@ -321,12 +315,7 @@ PROMISES = (
         STABLE,
         check_bounded,
     ),
-    Promise(
-        "the law in the end does not depend on the start",
-        "G Theorem 8",
-        ERGODIC,
-        check_initial_condition,
-    ),
+    Promise("the law in the end does not depend on the start", "G Theorem 8", ERGODIC, check_start),
     *error_promises("G (8), (10), derived", by="swaps and readings give them"),
     Promise(
         "errors are as large as P says: the mean NEES is n",

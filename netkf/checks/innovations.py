@@ -170,8 +170,7 @@ class RecordingFilter(Filter):
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> TimedState:
         """Return the state at time 0 with the estimate ``mean`` (n,), ``cov`` (n, n)."""
-        inner = self.inner.init(model, mean, cov, node)
-        return TimedState(inner, node, 0.0, (mean, None))
+        return TimedState(self.inner.init(model, mean, cov, node), node, 0.0, (mean, None))
 
     def predict(self, state: TimedState, gap: float) -> TimedState:
         """Return the state predicted over ``gap`` seconds, with the estimate before it."""
@@ -247,9 +246,7 @@ def compute_innovations(run: Run, max_events: int = MAX_EVENTS) -> Innovations:
     if len(run.log) and first_difference(run, replay) is not None:
         raise NetkfError("a replay makes other events than the run: it is of another version")
     # In slots the last readings come after the last state sample, when events are not recorded.
-    recorded = [
-        one for one in recorder.recorded if one.of_increments or one.time < scenario.horizon
-    ]
+    recorded = [r for r in recorder.recorded if r.of_increments or r.time < scenario.horizon]
     recorded.sort(key=lambda one: one.time)
     which = cache(lambda node: _rows_read(scenario, node))
     rows = [which(one.node) for one in recorded]

@@ -22,8 +22,8 @@ from netkf.checks.mode_sequences import (
     Reference,
     SwitchedReference,
     check_bounded,
-    check_initial_condition,
     check_law,
+    check_start,
     find_arrivals,
     initial_roots,
     intermittent_modes,
@@ -84,8 +84,7 @@ def _least_roots(scenario: Scenario) -> FloatArray:
         p = int(modes.rows[mode])
         try:
             # Whitened rows have noise of variance 1.
-            P = steady_covariance(F, Q, modes.H[mode, :p], np.eye(p))
-            roots[k] = np.linalg.cholesky(P)
+            roots[k] = np.linalg.cholesky(steady_covariance(F, Q, modes.H[mode, :p], np.eye(p)))
         except (TheoryError, np.linalg.LinAlgError):
             continue
     return roots
@@ -179,9 +178,7 @@ class IntermittentSamples(SwitchedReference):
         node = scenario.nodes[k]
         senders = sensing_neighbours(scenario)[node]
         random = Streams(self.seed).generator(purpose, node)
-        probabilities = np.array(
-            [_delivery_probability(scenario, (sender, node)) for sender in senders]
-        )
+        probabilities = np.array([_delivery_probability(scenario, (j, node)) for j in senders])
         arrived = random.random((samples, slots[-1], len(senders))) < probabilities
         # A set of readings is coded as a bit mask over the senders. Only sets that occur become
         # modes, since there may be 2^len(senders).
@@ -291,9 +288,7 @@ def _outage_factors(scenario: Scenario) -> dict[int, float]:
         if node in scenario.placed_sensors:
             continue
         try:
-            missed = [
-                1.0 - _delivery_probability(scenario, (sender, node)) for sender in neighbours[node]
-            ]
+            missed = [1.0 - _delivery_probability(scenario, (j, node)) for j in neighbours[node]]
         except TheoryError:
             continue
         factors[node] = float(np.prod(missed)) * alpha**2
@@ -428,10 +423,7 @@ PROMISES = (
         check_bounded,
     ),
     Promise(
-        "the law in the end does not depend on the start",
-        "R Theorem 9 [i]",
-        LIMIT,
-        check_initial_condition,
+        "the law in the end does not depend on the start", "R Theorem 9 [i]", LIMIT, check_start
     ),
     Promise(
         "averages over one path are those of the law of independent arrivals",

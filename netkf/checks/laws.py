@@ -74,8 +74,7 @@ def find(comparison: LawComparison, tolerance: float) -> Finding:
         return Finding((0.0, -np.inf, 0.0), tolerance, text)
     finding = find_largest(distances[: overall or None], tolerance, text)
     if comparison.worst is not None:
-        everything = finding.detectable
-        return find_largest(distances, tolerance, text)._replace(detectable=everything)
+        return find_largest(distances, tolerance, text)._replace(detectable=finding.detectable)
     if len(distances) == overall or not overall:
         return finding
     largest, label = max(distances[overall:], key=lambda item: item[0].value)

@@ -97,10 +97,6 @@ class Reference(NamedTuple):
         """Return the covariances (S, n, n) at the k-th number of slots and the i-th node."""
         return self._of_node(self.P[:, k], k, i)
 
-    def restarted_at(self, i: int) -> FloatArray:
-        """Return those at the last number of slots from the larger start (S, n, n)."""
-        return self._of_node(self.restarted, -1, i)
-
     def _of_node(self, values: FloatArray, k: int, i: int) -> FloatArray:
         return np.asarray(values[i] if self.at_node is None else values[0, self.at_node[k] == i])
 
@@ -116,9 +112,7 @@ class Reference(NamedTuple):
 
 @dataclass(frozen=True)
 class SwitchedReference(RunSamples):
-    """Adds simulated covariances with whose laws those of P in the runs are compared; derived
-    classes draw them.
-    """
+    """Adds simulated covariances to compare P of runs with; derived classes draw them."""
 
     @property
     def reference(self) -> Reference:
@@ -174,14 +168,14 @@ def check_bounded(samples: SwitchedReference, level: float) -> Finding:
     return samples.with_horizon(finding, lambda reference: reference.growth())
 
 
-def check_initial_condition(samples: SwitchedReference, level: float) -> Finding:
+def check_start(samples: SwitchedReference, level: float) -> Finding:
     """Compare the law of P at the end with that from a far larger start."""
     reference, last = samples.reference, len(check_slots(samples.scenario)) - 1
     pairs = [
         Pair(
             f"node {node}",
             samples.runs.P[:, -1, i],
-            reference.restarted_at(i),
+            reference._of_node(reference.restarted, -1, i),
             reference.at(last, i),
         )
         for i, node in enumerate(samples.nodes)
@@ -269,9 +263,7 @@ def gossip_modes(scenario: Scenario) -> ModeTable:
 def sensing_neighbours(scenario: Scenario) -> dict[int, tuple[int, ...]]:
     """Return the nodes with sensors that each node may hear, in order."""
     sensing, topology = set(scenario.sensing_nodes), scenario.topology
-    return {
-        node: tuple(k for k in topology.senders(node) if k in sensing) for node in topology.nodes
-    }
+    return {i: tuple(k for k in topology.senders(i) if k in sensing) for i in topology.nodes}
 
 
 def intermittent_modes(scenario: Scenario, sets: list[tuple[int, ...]]) -> ModeTable:
@@ -305,6 +297,5 @@ def find_arrivals(scenario: Scenario, run: Run | None, slots: int) -> tuple[Mode
         own_reading = (node,) if node in scenario.placed_sensors else ()
         for t in range(slots):
             heard = neighbours[node] if run is None else arrived.get((node, t), ())
-            nodes = tuple(sorted((*own_reading, *heard)))
-            sequences[k, t] = modes.setdefault(nodes, len(modes))
+            sequences[k, t] = modes.setdefault(tuple(sorted((*own_reading, *heard))), len(modes))
     return intermittent_modes(scenario, list(modes)), sequences

@@ -94,8 +94,7 @@ class PushSumSamples(RunSamples):
     @cached_property
     def ratios(self) -> tuple[FloatArray, FloatArray]:
         """Mean squares |W e|^2 / n (R', N) at the end (W is ``steady_root``), sums of squares of
-        normals with as weights the eigenvalues (R', N, n) of W Sigma W' given the links that were
-        up.
+        normals, weighted by eigenvalues (R', N, n) of W Sigma W' given the links that were up.
         """
         W, Sigma = self.steady_root, self.runs.Sigma[self.followed, -1]
         e = np.einsum("iab,rib->ria", W, self.runs.e[self.followed, -1])
@@ -131,7 +130,7 @@ def _horizon_factor(samples: PushSumSamples, limit: FloatArray) -> float:
 
 
 @error_test
-def _check_unbiased(samples: PushSumSamples, level: float) -> Finding:
+def _no_bias(samples: PushSumSamples, level: float) -> Finding:
     if not len(samples.followed):
         return find_unknown("no run has errors that were followed exactly", BIAS_TOLERANCE)
     if not np.isfinite(samples.standardised).all():
@@ -173,9 +172,7 @@ def _mean_square(samples: PushSumSamples, level: float) -> Finding:
     # Early if already the expected mean squares are not the steady ones, unless the promise is
     # broken: the lower limits are those of the distance from what is expected.
     off_limit = float(np.abs(expected - 1.0).max())
-    early = off_limit > SQUARE_TOLERANCE and not any(
-        distance.low > 0.0 for distance, _ in intervals
-    )
+    early = off_limit > SQUARE_TOLERANCE and not any(one.low > 0.0 for one, _ in intervals)
     return finding._replace(early=early)
 
 
@@ -250,10 +247,7 @@ PROMISES = (
         exact=True,
     ),
     Promise(
-        "the estimates become unbiased",
-        "P Theorem 5, (30)",
-        (*LAWS, "P (30)", *FOLLOWED),
-        _check_unbiased,
+        "the estimates become unbiased", "P Theorem 5, (30)", (*LAWS, "P (30)", *FOLLOWED), _no_bias
     ),
     Promise(
         "mean squares become the exact steady ones",

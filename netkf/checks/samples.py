@@ -1,6 +1,4 @@
-"""Samples of many runs at the times and nodes where promises are checked, and tests that papers
-share.
-"""
+"""Samples of many runs at the times and nodes where promises are checked, and shared tests."""
 
 from __future__ import annotations
 
@@ -59,8 +57,7 @@ def check_times(scenario: Scenario) -> list[float]:
 def errors_at_once(scenario: Scenario) -> int:
     """Return the number of scalar errors of all filters at one time."""
     pooled = scenario.filter.algorithm.timing.pooled and scenario.views is None
-    filters = 1 if pooled else len(scenario.nodes)
-    return filters * scenario.width
+    return (1 if pooled else len(scenario.nodes)) * scenario.width
 
 
 def probe_times(scenario: Scenario) -> list[float]:
@@ -222,11 +219,7 @@ def check_replay(samples: RunSamples, level: float) -> Finding:
         f"{gap.size:,} covariances replayed from the events of their runs; the worst in run "
         f"{np.flatnonzero(replayed)[run]} at {label}"
     )
-    limits = (
-        np.abs(expected).max(axis=(-1, -2)),
-        samples.largest_terms(expected),
-        REPLAY_TOLERANCE,
-    )
+    limits = np.abs(expected).max(axis=(-1, -2)), samples.largest_terms(expected), REPLAY_TOLERANCE
     return compare_points(samples, gap, limits, message, replicas=np.flatnonzero(replayed))
 
 

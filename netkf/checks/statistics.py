@@ -48,17 +48,14 @@ def law_distance(
     first: FloatArray, second: FloatArray, level: float, rounding: float = 0.0
 ) -> Interval:
     """Return an interval for sup |F - G| of the laws of two samples (Kolmogorov-Smirnov), which may
-    depend on each other; values less than ``rounding`` apart are equal, further runs add to the
-    first.
+    depend on each other; values within ``rounding`` are equal, further runs add to the first.
     """
     gaps = np.abs(_ecdf_gaps(first, second, rounding))
     return _band_interval(gaps, len(first), len(second), level, grow=False)
 
 
 def law_excess(first: FloatArray, second: FloatArray, level: float) -> Interval:
-    """Return an interval for the largest ``P(second > x) - P(first > x)`` of samples (S,) and
-    (S',), to both of which further runs add.
-    """
+    """Return an interval for the largest ``P(second > x) - P(first > x)`` of (S,) and (S',)."""
     gaps = _ecdf_gaps(first, second, rounding=0.0)
     return _band_interval(gaps, len(first), len(second), level, grow=True)
 
@@ -181,8 +178,7 @@ def eigenvalue_interval(samples: FloatArray, level: float) -> Interval:
     Scheffe's method with Hotelling's T^2.
     """
     count, n = len(samples), samples.shape[-1]
-    mean = samples.mean(axis=0)
-    values, vectors = np.linalg.eigh(mean)
+    values, vectors = np.linalg.eigh(samples.mean(axis=0))
     entries = n * (n + 1) // 2
     # T^2 = p (R - 1) / (R - p) F(p, R - p) for p entries; /R for the mean.
     freedom = max(count - entries, 1)
@@ -192,8 +188,7 @@ def eigenvalue_interval(samples: FloatArray, level: float) -> Interval:
     deviations = np.einsum("ia,rij,ja->ra", vectors, samples, vectors).std(axis=0, ddof=1)
     low = float((values - reach * deviations).max())
     # The upper limit needs every direction: the largest standard deviation of any is used.
-    flat = samples.reshape(count, -1)
-    covariance = np.atleast_2d(np.cov(flat, rowvar=False))
+    covariance = np.atleast_2d(np.cov(samples.reshape(count, -1), rowvar=False))
     widest = math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0))
     # Student's statistic of the direction with the largest mean must exceed Hotelling's limit.
     spread = float(deviations.max()) / math.sqrt(count)

@@ -69,12 +69,13 @@ def _save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: s
     with writing_file(directory / PICTURE):
         (directory / PICTURE).unlink(missing_ok=True)
     document = verdict_json(verdict)
+    values = ((k, name, getattr(r, name)) for k, r in enumerate(verdict.rows) for name in NUMBERS)
     document |= {
         "digest": scenario_digest(scenario),
         "versions": versions(),
         "looks": verdict.looks,
         "spent": verdict.spent,
-        "infinite": _infinite_numbers(verdict),
+        "infinite": [(k, name, bool(value > 0.0)) for k, name, value in values if np.isinf(value)],
         "machine": machine(),
         "files": file_digests(directory, [RESULTS, "scenario.toml"]),
     }
@@ -118,7 +119,12 @@ def load_verdict(directory: Path, scenario: Scenario, seed: int) -> Verdict:
         check_seal(document)
         check_files(directory, document)
         looks, spent = int(document["looks"]), float(document["spent"])
-        rows = _read_rows(document)
+        entries = [dict(row) for row in document["rows"]]
+        for row in entries:
+            row |= {name: np.nan for name in NUMBERS if row[name] is None}
+        for k, name, positive in document.get("infinite", ()):
+            entries[k][str(name)] = np.inf if positive else -np.inf
+        rows = tuple(Evidence(**row) for row in entries)
         results = _read_results(directory / RESULTS)
         count, confidence = int(document["runs"]), float(document["confidence"])
     except Exception as error:  # the files may hold anything
@@ -133,23 +139,6 @@ def load_verdict(directory: Path, scenario: Scenario, seed: int) -> Verdict:
         problem = f"{directory} holds {len(results)} results of {count} runs"
         raise ScenarioError("--resume", problem, str(directory), "start a new directory")
     return Verdict(scenario.name, count, seed, confidence, rows, tuple(results), looks, spent)
-
-
-def _infinite_numbers(verdict: Verdict) -> list[tuple[int, str, bool]]:
-    """Return (row, field, is positive) of all infinite numbers, which JSON stores as null."""
-    values = (
-        (k, name, getattr(row, name)) for k, row in enumerate(verdict.rows) for name in NUMBERS
-    )
-    return [(k, name, bool(value > 0.0)) for k, name, value in values if np.isinf(value)]
-
-
-def _read_rows(document: dict[str, Any]) -> tuple[Evidence, ...]:
-    rows = [dict(row) for row in document["rows"]]
-    for row in rows:
-        row |= {name: np.nan for name in NUMBERS if row[name] is None}
-    for k, name, positive in document.get("infinite", ()):
-        rows[k][str(name)] = np.inf if positive else -np.inf
-    return tuple(Evidence(**row) for row in rows)
 
 
 def _read_results(path: Path) -> list[ReplicaResult]:

@@ -1,7 +1,6 @@
 """Pictures of finished commands. They are optional: a missing one never changes the exit status.
 
-Drawing functions are named as (module, function), since importing their modules imports
-matplotlib.
+Drawing functions are named as (module, function): their modules import matplotlib.
 """
 
 from __future__ import annotations

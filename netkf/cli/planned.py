@@ -90,7 +90,6 @@ def run_plan(options: argparse.Namespace) -> int:
 def _print_plan(
     directory: Path, scenario: Scenario, what: str, tasks: int, options: argparse.Namespace
 ) -> None:
-    """Print what a plan holds and how to go on, and with ``--slurm`` the script of an array."""
     print_notes(scenario.notes)
     # With a script on standard output, what a person reads goes beside it.
     out = sys.stderr if options.slurm else sys.stdout
@@ -328,7 +327,6 @@ def _run_on(
 
 
 def _print_missing(plan: Plan, gaps: list[Gap], rounds: bool = False) -> None:
-    """Print which runs have no result, and what to do."""
     short = [gap for gap in gaps if gap.missing]
     missing = sum(len(runs) for gap in short for runs in gap.missing)
     total = sum(gap.runs for gap in gaps)
@@ -361,5 +359,4 @@ def _missing_parts(gaps: list[Gap], tasks: int) -> set[int]:
 
 
 def _describe_range(numbers: range) -> str:
-    """Return a range of runs, or of jobs, as text."""
     return f"{numbers[0]}" if len(numbers) == 1 else f"{numbers[0]}-{numbers[-1]}"

@@ -217,8 +217,7 @@ class OutputError(OSError):
 
 
 class SafeStream:
-    """A text stream that escapes control characters, so that text from files cannot control the
-    terminal.
+    """A text stream that escapes control characters: files cannot control the terminal.
 
     A ``lossy`` stream ignores errors of writing. Others raise OutputError, except for a broken
     pipe: the reader, such as ``head``, needs no more output, so that the rest is discarded.

@@ -56,21 +56,18 @@ def run_sweep(options: argparse.Namespace) -> int:
     return 0
 
 
-def _print_sweep(
-    scenario: Scenario, completed: CompletedSweep, options: argparse.Namespace
-) -> None:
+def _print_sweep(scenario: Scenario, sweep: CompletedSweep, options: argparse.Namespace) -> None:
     print_table_notes(scenario)
     if options.json:
-        rows = completed.table.to_dict("records")
-        print_json({"directory": str(completed.directory), "rows": rows})
+        rows = sweep.table.to_dict("records")
+        print_json({"directory": str(sweep.directory), "rows": rows})
         return
     runs = options.runs
     print_title(scenario)
-    print(f"\n{format_sweep(completed.table, completed.keys)}\n")
-    points = len(completed.table)
-    line = f"{count_phrase(points, 'point')} of {count_phrase(runs, 'run')}"
-    line += f" in {completed.seconds:.2f} s"
-    line += "" if "seed" in completed.keys else ", all with the same random draws"
+    print(f"\n{format_sweep(sweep.table, sweep.keys)}\n")
+    line = f"{count_phrase(len(sweep.table), 'point')} of {count_phrase(runs, 'run')}"
+    line += f" in {sweep.seconds:.2f} s"
+    line += "" if "seed" in sweep.keys else ", all with the same random draws"
     print(line + ("; +- one standard error" if runs > 1 else ""))
 
 

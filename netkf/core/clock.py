@@ -149,8 +149,7 @@ def generate_ticks(
         if not len(block):
             break
         blocks.append(block)
-        number = position.number + len(block)
-        position = position._replace(number=number, now=float(block[-1]))
+        position = position._replace(number=position.number + len(block), now=float(block[-1]))
         count = min(2 * count, MAX_BLOCK)
     times = np.concatenate(blocks)
     return times[: int(np.searchsorted(times, horizon))]

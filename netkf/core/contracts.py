@@ -67,9 +67,7 @@ def is_netkf_class(cls: type) -> bool:
 
 
 def source_line(code: CodeType, line: int | None = None) -> str:
-    """Return "file, line n" of a function's ``code``, or of a ``line`` in it: the path is relative
-    where the file is below the current folder.
-    """
+    """Return "file, line n" of ``code``, or of a ``line`` in it, relative if it is below here."""
     return file_line(code.co_filename, code.co_firstlineno if line is None else line)
 
 
@@ -135,9 +133,7 @@ def _describe_compilation(error: Any) -> str:
 
 
 def kernel_problem(value: Any, names: Sequence[str]) -> str:
-    """Return what is wrong with a ``value`` that should be a kernel with arguments of these
-    ``names``, "" if nothing is.
-    """
+    """Return what is wrong with a ``value`` as a kernel of these ``names``, "" if nothing is."""
     if not (isinstance(value, Kernel) or (is_plain() and callable(value))):
         return f"must be a kernel (netkf.kernels.kernel), not {quote(value)}"
     loops = inspect.unwrap(getattr(value, "loops", value))
@@ -171,8 +167,7 @@ def _member_of_netkf(cls: type, name: str) -> Any:
     """Return the nearest of netkf's members ``name``, a dataclass field if it is one, or None."""
     for parent in cls.__mro__[1:]:
         if is_netkf_class(parent) and name in _own_names(parent):
-            fields = vars(parent).get("__dataclass_fields__", {})
-            return fields.get(name, vars(parent).get(name))
+            return vars(parent).get("__dataclass_fields__", {}).get(name, vars(parent).get(name))
     return None
 
 
@@ -275,9 +270,7 @@ def _used_names(classes: Sequence[type]) -> set[str]:
         members = dict(vars(cls))
         for owner, member in members.items():
             parts = getattr(member, "__match_args__", ())
-            used |= {
-                part for part in parts if getattr(member, part, None) is members.get(part, dis)
-            }
+            used |= {p for p in parts if getattr(member, p, None) is members.get(p, dis)}
             held = [getattr(member, part, None) for part in (*parts, "fget", "func", "__func__")]
             functions = [inspect.unwrap(f) for f in (member, *held) if callable(f)]
             used |= {n for n, f in members.items() if n != owner and callable(f) and f in functions}

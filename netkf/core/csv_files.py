@@ -67,8 +67,7 @@ class Columns(dict[str, FloatArray]):
 
     def refuse_early(self, early: np.ndarray, rule: str) -> None:
         """Raise ScenarioError with the text ``rule`` and the line of the first of the rows that are
-        too ``early`` (indices), if no origin is given: of a longer log a scenario may choose where
-        it begins.
+        too ``early`` (indices), if no origin is given: a longer log may begin anywhere.
         """
         if early.size and not self.source.stamps.origin:
             row = int(early[0])
@@ -78,8 +77,7 @@ class Columns(dict[str, FloatArray]):
     def of_node(self, node: int | None) -> Columns:
         """Return the rows of ``node`` (id), or all of a table without a column node.
 
-        Raises ScenarioError if there are none, or for a table of several nodes where ``node`` is
-        None.
+        Raises ScenarioError if there are none, or for several nodes where ``node`` is None.
         """
         if "node" not in self:
             return self
@@ -128,7 +126,7 @@ def read_columns(
     Raises ScenarioError, with the file and the line, for a missing column, a row of another length
     than the header, or an entry that is not a finite number, or no stamp in a column of STAMPS.
     """
-    numbers, lines, half_digits = array("d"), array("q"), array("d")
+    numbers, lines, halves = array("d"), array("q"), array("d")
     with open_table(source) as sheet:
         _require_columns(source, sheet, required)
         names = [name for name in (*required, *optional) if name in sheet.header]
@@ -137,10 +135,7 @@ def read_columns(
                 rule = f"{source.name} must have one column {name}"
                 raise ScenarioError("path", rule, sheet.header, "rename the others")
         entries = _Entries(source, sheet)
-        places = [
-            (sheet.header.index(name), name in nodes, name in STAMPS, name in gaps)
-            for name in names
-        ]
+        places = [(sheet.header.index(n), n in nodes, n in STAMPS, n in gaps) for n in names]
         named = {sheet.header.index(name): words[name] for name in names if name in words}
         for line, row in sheet.rows:
             entries.begin(line, row)
@@ -155,10 +150,8 @@ def read_columns(
                 else:
                     numbers.append(entries.number(column, may_miss))
                 if sheet.header[column] == "t":
-                    half_digits.append(
-                        source.stamps.half_digit(row[column].replace(",", ".").strip())
-                    )
-    columns = Columns(source, np.array(lines, dtype=np.int64), np.array(half_digits))
+                    halves.append(source.stamps.half_digit(row[column].replace(",", ".").strip()))
+    columns = Columns(source, np.array(lines, dtype=np.int64), np.array(halves))
     table = np.array(numbers, dtype=np.float64).reshape(len(lines), len(names))
     columns.update(zip(names, np.ascontiguousarray(table.T), strict=True))
     return columns
@@ -219,9 +212,7 @@ class _Entries:
         return self._limited(column, value)
 
     def word(self, column: int, words: tuple[str, ...]) -> int:
-        """Return the index in ``words`` of the entry in the column with this index; raises
-        ScenarioError if it is none of them.
-        """
+        """Return the index in ``words`` of a column's entry; raises ScenarioError for others."""
         word = self._row[column].strip()
         if word not in words:
             remedy = f"{suggest_nearest(word, words)}correct the entry"
@@ -333,11 +324,9 @@ class _Bounded(io.RawIOBase):
         self._file, self._left = file, MAX_BYTES
 
     def readable(self) -> bool:
-        """Return True: it is opened to be read."""
         return True
 
     def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
-        """Fill ``buffer`` with the next bytes and return their number."""
         data = self._file.read(len(buffer))
         self._left -= len(data)
         if self._left < 0:
@@ -398,9 +387,7 @@ def read_content(source: SourceFile) -> bytes:
 
 @contextmanager
 def open_table(source: SourceFile) -> Iterator[_Sheet]:
-    """Yield the header and the rows, as texts, of an open table; raises ScenarioError if the file
-    is none.
-    """
+    """Yield the header and the rows of an open table, as texts; raises ScenarioError."""
     remedy = "split readings among several [[sensors]] entries, or write fewer digits"
     with _unpacked(source, " as a UTF-8 table", remedy) as unpacked:
         buffered = io.BufferedReader(unpacked, 1 << 16)

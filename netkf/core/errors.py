@@ -36,7 +36,6 @@ class WriteError(NetkfError, OSError):
         self.filename = str(path)
 
     def __str__(self) -> str:
-        """Return the reason and the path as one line."""
         return f"cannot write: {self.strerror} ({shorten(self.filename, 1000)})"
 
 
@@ -69,9 +68,7 @@ class ScenarioError(NetkfError, ValueError):
         return ScenarioError(self.key, self.rule, self.value, self.remedy, self.file or file)
 
     def __str__(self) -> str:
-        """Return the mistake as one line, ``file: key: rule; got value; remedy``, each part
-        shortened.
-        """
+        """Return one line, ``file: key: rule; got value; remedy``, each part shortened."""
         # All texts are limited: they may contain names of keys, classes and files of any length.
         file, key = shorten(self.file, 1000), shorten(self.key, 120)
         rule, remedy = shorten(self.rule, 1000), shorten(self.remedy, 700)
@@ -82,9 +79,7 @@ class ScenarioError(NetkfError, ValueError):
 
 @contextmanager
 def errors_under(prefix: str) -> Iterator[None]:
-    """Put ``prefix``, the table that a block of code reads or checks, before the keys of the
-    ScenarioErrors that it raises.
-    """
+    """Put ``prefix``, the table that a block of code checks, before keys of ScenarioErrors."""
     try:
         yield
     except ScenarioError as error:

@@ -62,8 +62,7 @@ class Rule:
         except ScenarioError as error:
             raise error.under(key) from None
         except _SpecificError as error:
-            remedy = error.remedy or self.remedy
-            raise ScenarioError(key, str(error), value, remedy) from None
+            raise ScenarioError(key, str(error), value, error.remedy or self.remedy) from None
         except (TypeError, ValueError, OverflowError, RecursionError):
             # The requirement tells the user more than Python's own message.
             raise ScenarioError(key, self.requirement, value, self.remedy) from None
@@ -127,9 +126,7 @@ class Component:
             hold_to_contract(cls)
 
     def __post_init__(self) -> None:
-        """Check and convert each field by its rule; raises ScenarioError for a value that breaks
-        it.
-        """
+        """Check and convert each field by its rule; raises ScenarioError if one breaks it."""
         for field in dataclasses.fields(self):
             value, rule = getattr(self, field.name), field.metadata.get("rule")
             if rule is not None and not (value is None and field.default is None):
@@ -140,7 +137,6 @@ class Component:
             getattr(self, self._reads)
 
     def __eq__(self, other: object) -> bool:
-        """Return True if both components have the same class and equal fields."""
         if type(self) is not type(other):
             return NotImplemented
         return all(
@@ -616,7 +612,6 @@ class SourceFile:
     unknown: dict[str, int] = dataclasses.field(default_factory=dict, compare=False)
 
     def __repr__(self) -> str:
-        """Return the quoted path as written, without the folder."""
         return repr(self.name)
 
     @property

@@ -80,9 +80,7 @@ class TimeGrid:
         return round(ticks) / self.per_second if math.isfinite(ticks) else time
 
     def before(self, horizon: float, times: np.ndarray) -> FloatArray:
-        """Return those of ``times`` (K,) that are instants before the ``horizon``, in seconds, in
-        canonical form.
-        """
+        """Return the instants among ``times`` (K,) before ``horizon`` (s), in canonical form."""
         instants = self.snap(times)
         return np.asarray(instants[instants < horizon])
 

@@ -107,9 +107,7 @@ def weibull_law(shape: float) -> WaitingLaw:
 
 
 def lognormal_law(mean: float, sigma: float) -> WaitingLaw:
-    """Return the lognormal law of a ``mean`` in seconds whose logarithm has the standard deviation
-    ``sigma``.
-    """
+    """Return the lognormal law of a ``mean`` in seconds, its logarithm of deviation ``sigma``."""
     from scipy.special import ndtr, ndtri
 
     return WaitingLaw(

@@ -35,9 +35,7 @@ class TimeBase:
     origin: Decimal = Decimal(0)
 
     def seconds(self, text: str) -> float:
-        """Return the simulated seconds of the stamp ``text``, rounded once; raises ValueError if it
-        is neither a number nor an ISO 8601 time.
-        """
+        """Return the seconds of the stamp ``text``, rounded once; ValueError for other texts."""
         if self.unit == "s" and not self.origin and "_" not in text:
             # The common case: the value is the number as it stands.
             try:

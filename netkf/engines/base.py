@@ -28,8 +28,7 @@ class Rank(IntEnum):
 
     The origin of coordinates moves first. Nodes go down and up. Sensors read, and nodes use all
     samples of the instant. Then clocks tick, and senders take a snapshot of their state; then
-    delayed messages arrive; then every node with messages absorbs all of them at once. Probes see
-    the result.
+    delayed messages arrive; then every node with messages absorbs all of them. Probes are last.
     """
 
     REBASE = 0
@@ -95,8 +94,7 @@ class Engine(ABC):
             recorder = Recorder([sink], counts_only=not recorded)
             # Streams depend on the seed and the replica alone: any division into calls gives the
             # same runs.
-            status = self.run(scenario, Streams(seed, replica), recorder, silent)
-            sink.finish(recorder, status)
+            sink.finish(recorder, self.run(scenario, Streams(seed, replica), recorder, silent))
             yield sink.batch()
 
 

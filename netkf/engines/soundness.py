@@ -22,8 +22,7 @@ def stack_estimates(
     xhat = np.array([mean for mean, _ in pairs])
     without = np.array([cov is None for _, cov in pairs])
     none = np.full((xhat.shape[1],) * 2, np.nan)
-    P = np.array([none if cov is None else cov for _, cov in pairs])
-    return xhat, P, without
+    return xhat, np.array([none if cov is None else cov for _, cov in pairs]), without
 
 
 INDEFINITE = 1e-9
@@ -37,8 +36,7 @@ def sound_mask(
     error: FloatArray | None = None,
     of_roots: bool = False,
 ) -> BoolArray:
-    """Return a mask (...) of sound pairs of estimates ``xhat`` (..., n) and covariances ``P``
-    (..., n, n).
+    """Return a mask (...) of sound pairs of ``xhat`` (..., n) and ``P`` (..., n, n).
 
     Both must be finite, and the covariance positive semidefinite; a filter ``without`` covariance
     (mask (...), or False for none) needs only a finite estimate. Estimates are in the plant's
@@ -78,8 +76,7 @@ def describe_divergence(
     nodes: Sequence[int], x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
 ) -> str:
     """Return what ended a run as diverged, as the subject and verb of a sentence: what passed the
-    largest number, is not a number, or is not positive semidefinite, at which of the N ``nodes``
-    (ids).
+    largest number, is not a number, or not positive semidefinite, at which ``nodes`` (N,).
 
     The others are the samples of the run, or its last one or two: true states ``x`` (T, n), nan if
     unknown, ``xhat`` (T, N, n), ``P`` (T, N, n, n), nan where a filter gives none, and ``error`` =

@@ -16,9 +16,7 @@ CONNECT_SECONDS = 5
 
 
 def scheduler_answers(address: str, seconds: float) -> bool:
-    """Return True if a Dask scheduler answers at ``address`` within ``seconds``, as a process finds
-    out that runs this module.
-    """
+    """Return True if a Dask scheduler answers within ``seconds``, asked by another process."""
     # -P keeps Python from importing modules of the current folder.
     command = [sys.executable, "-P", "-m", "netkf.ensembles.ask_scheduler", address]
     null = subprocess.DEVNULL

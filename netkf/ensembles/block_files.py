@@ -111,9 +111,7 @@ class BlockFiles(ABC):
 
     @abstractmethod
     def require_fit(self, arrays: Any, stored: dict[str, Any]) -> int:
-        """Return the number of runs of which the arrays of a block are; raises DamagedError unless
-        they fit its ``stored`` identity.
-        """
+        """Return the runs of a block's arrays; raises DamagedError if ``stored`` misfits."""
 
     def find(
         self, identity: RunIdentity, any_installation: bool = False, within: range | None = None
@@ -251,7 +249,6 @@ class BlockFiles(ABC):
             return stored
 
     def _path(self, node: Node) -> Path:
-        """Return the path of the block of a node."""
         return self._folder / _name_of(node)
 
     @contextlib.contextmanager
@@ -325,9 +322,7 @@ def digest_of(file: BinaryIO, length: int) -> bytes:
 
 @contextlib.contextmanager
 def open_block(file: Path, verified: bool = True) -> Iterator[Any]:
-    """Yield the arrays, by name, of a block's npz file, whose digest is checked unless that was
-    ``verified`` before; raises DamagedError.
-    """
+    """Yield a block's arrays by name, its digest checked but if ``verified``; DamagedError."""
     try:
         if not verified:
             verify(file)

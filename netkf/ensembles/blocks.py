@@ -73,8 +73,7 @@ class BlockResult(NamedTuple):
 
 
 def work(job: Job) -> BlockResult:
-    """Do a block of work, in a worker or in this process; return what its task returns for its
-    replicas.
+    """Do a block of work, in a worker or in this process; return the results of its replicas.
 
     Raises EngineError with the name of the class if a plugged-in class fails.
     """
@@ -172,7 +171,6 @@ def _check_versions(required_versions: tuple[tuple[str, str], ...]) -> None:
 
 
 def _unpickle(packed: PackedScenario) -> Scenario:
-    """Return the scenario of ``packed`` in a worker."""
     if packed.versions:
         _check_versions(packed.versions)
     for name, folder in packed.modules:

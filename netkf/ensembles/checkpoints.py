@@ -54,9 +54,7 @@ class BlockCheckpoints(BlockFiles):
         """Return the statistics of a block as arrays by name."""
         arrays: dict[str, Any] = {"totals": value.totals}
         moments = {name: getattr(value, name) for name in PARTS}
-        moments |= {
-            f"conserved_{name}": quantity for name, (quantity, _) in value.conserved.items()
-        }
+        moments |= {f"conserved_{name}": one for name, (one, _) in value.conserved.items()}
         for name, quantity in moments.items():
             arrays |= {f"{name}_{field}": getattr(quantity, field) for field in Moments._fields}
         for k, trace in enumerate(value.traces):
@@ -165,7 +163,6 @@ class BlockCheckpoints(BlockFiles):
         )
 
     def _restore_trace(self, arrays: Any, k: int) -> Trace:
-        """Return the k-th trace of a block from its stored ``arrays``."""
         trace: Any = Trace(*(arrays[f"trace_{k}_{name}"] for name in Trace._fields))
         T, N, n = len(trace.times), len(self._scenario.nodes), self._scenario.width
         # replica, log, times, x, xhat, P, error
@@ -183,8 +180,6 @@ def _read_texts(arrays: Any) -> dict[str, Any]:
 
 
 def _restore_statistics(arrays: Any) -> RunStatistics:
-    """Return the statistics of a block, without its traces, from the arrays of its file."""
-
     def moments(name: str) -> Moments:
         return Moments(*(arrays[f"{name}_{field}"] for field in Moments._fields))
 

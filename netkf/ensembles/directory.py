@@ -164,8 +164,7 @@ def write_files(
 class DirectoryWriter:
     """Writes the blocks of an ensemble to its directory, and updates the manifest.
 
-    ``known`` are the nodes that are stored; ``tasks`` the number of jobs for which it was planned,
-    0 if it was not.
+    ``known`` are the nodes that are stored; ``tasks`` the jobs of its plan, 0 without one.
     """
 
     def __init__(

@@ -21,11 +21,9 @@ class MergeTree:
         self._waiting: dict[tuple[int, int], Any] = {}
 
     def add(self, k: int, value: Any, level: int = 0) -> None:
-        """Add the result ``value`` of node (level, k), which covers the blocks k 2^level to (k + 1)
-        2^level - 1.
+        """Add the ``value`` of node (level, k), of the blocks k 2^level to (k + 1) 2^level - 1.
 
-        Nodes must not overlap; the last may have fewer replicas. Level 0 may stand for blocks of
-        any one size.
+        Nodes must not overlap; the last may be smaller. Level 0 may be of blocks of any one size.
         """
         while (level, k ^ 1) in self._waiting:
             neighbour = self._waiting.pop((level, k ^ 1))

@@ -136,10 +136,8 @@ def monte_carlo(
     seed, count = scenario.seed if seed is None else seed, require_runs(runs)
     task, asked = partial(block_statistics, engine=chosen), (scenario, count, seed)
     pool, together = PoolOptions(workers, executor, scheduler), chosen.together(scenario)
-    statistics = replicate_blocks(
-        task, merge, *asked, pool=pool, progress=progress, together=together
-    )
-    return ensemble_of(scenario, statistics, seed, chosen.name)
+    merged = replicate_blocks(task, merge, *asked, pool=pool, progress=progress, together=together)
+    return ensemble_of(scenario, merged, seed, chosen.name)
 
 
 def ensemble_of(scenario: Scenario, statistics: RunStatistics, seed: int, engine: str) -> Ensemble:

@@ -2,8 +2,7 @@
 
 The study is run again and again by ``netkf work`` and ``netkf merge``, on a pool with a plan: each
 ensemble that it asks for has a folder of blocks, in the order in which it asks. As a study is
-deterministic, all commands meet the same ensembles, up to the first whose results it needs and that
-lacks some.
+deterministic, all commands meet the same ensembles, up to the first that lacks results.
 """
 
 from __future__ import annotations

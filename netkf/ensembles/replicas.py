@@ -61,9 +61,7 @@ class Form(NamedTuple):
 
 def form_of(kind: Any) -> Form:
     """Return the form of results that are named tuples of arrays of this ``kind``."""
-    return Form(
-        lambda value: value._asdict(), lambda arrays: kind(*(arrays[k] for k in kind._fields))
-    )
+    return Form(lambda v: v._asdict(), lambda arrays: kind(*(arrays[k] for k in kind._fields)))
 
 
 class Gap(NamedTuple):
@@ -192,7 +190,6 @@ def _as_list(task: Task, scenario: Scenario, seed: int, replica: int) -> list[An
 
 
 def _make_blocks(pool: Pool, job: Job, together: int | None, store: BlockStore) -> Iterator[Job]:
-    """Yield the blocks of replicas of ``job`` that are to be simulated, in order, each as a Job."""
     # Runs in slots are simulated in SIMD lanes: fewer runs than lanes take as long.
     slotted = isinstance(job.scenario, Scenario) and job.scenario.slotted
     min_size = together or (LANES if slotted else 1)

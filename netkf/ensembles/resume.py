@@ -39,8 +39,7 @@ def is_finished(out: Path | None, scenario: Scenario, plan: RunIdentity) -> bool
     command left there, and None if it is new or empty.
 
     ``plan`` is what the command would run now. Raises ScenarioError unless the directory holds a
-    run of this plan and of this installation only, whose files were not changed since they were
-    written.
+    run of this plan and installation only, whose files were not changed since.
     """
     if out is None:
         remedy = "add --out DIR with the directory of the run that was stopped"
@@ -143,7 +142,6 @@ def _require_own_files(directory: Path, names: Collection[str]) -> None:
 
 
 def _check_scenario(directory: Path, scenario: Scenario) -> None:
-    """Raise ScenarioError if the directory's scenario.toml is not that of ``scenario``."""
     path, text = directory / "scenario.toml", to_toml(resolve_defaults(scenario))
     if not path.exists():
         return

@@ -151,7 +151,6 @@ def simulate_batches(
 def _recorded_run(
     scenario: Scenario, seed: int, replica: int, engine: Engine, *sinks: Sink
 ) -> tuple[RunBatch, FloatArray | None, Recorder]:
-    """Simulate one ``replica`` of the runs of ``seed`` with its events."""
     sink, wanted = batch_sink(scenario, range(replica, replica + 1)), scenario.metrics.network
     network = [NetworkSink(scenario, seed, replica)] if wanted else []
     recorder = Recorder([sink, *network, *sinks])

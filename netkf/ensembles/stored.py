@@ -42,9 +42,7 @@ class StoredEnsemble(WithPromises, Ensemble):
     status: str
 
     def replica(self, number: int = 0) -> StoredRun:
-        """Return run ``number`` of the ensemble, from 0 on; raises ScenarioError if its events and
-        samples (its trace) were not kept.
-        """
+        """Return run ``number``, from 0; raises ScenarioError if its trace was not kept."""
         assert self.scenario is not None
         where = shorten(self.directory)
         number = integer(low=0)("replica", number)
@@ -68,7 +66,13 @@ def read_ensemble(directory: Path, scenario: Scenario, manifest: dict[str, Any])
     stored: dict[str, Any] = {"directory": directory, "manifest": manifest}
     stored["status"] = str(manifest["status"])
     if not (directory / "ensemble.parquet").exists():
-        ensemble = _of_blocks(directory, scenario, manifest)
+        blocks = BlockCheckpoints(directory, scenario)
+        found = blocks.readable(scenario_digest(scenario), int(manifest["seed"]))
+        if not found:
+            raise DamagedError("no run of it was finished")
+        ensemble = ensemble_of(
+            scenario, reduce(merge, found), int(manifest["seed"]), str(manifest.get("engine", ""))
+        )
         values: dict[str, Any] = {f.name: getattr(ensemble, f.name) for f in fields(Ensemble)}
         return StoredEnsemble(**values, **stored, summary={})
     check_files(directory, manifest, ["ensemble.parquet", "summary.json"])
@@ -102,16 +106,6 @@ def read_ensemble(directory: Path, scenario: Scenario, manifest: dict[str, Any])
         scenario=scenario,
         **stored,
         summary=summary,
-    )
-
-
-def _of_blocks(directory: Path, scenario: Scenario, manifest: dict[str, Any]) -> Ensemble:
-    blocks = BlockCheckpoints(directory, scenario)
-    found = blocks.readable(scenario_digest(scenario), int(manifest["seed"]))
-    if not found:
-        raise DamagedError("no run of it was finished")
-    return ensemble_of(
-        scenario, reduce(merge, found), int(manifest["seed"]), str(manifest.get("engine", ""))
     )
 
 

@@ -27,9 +27,7 @@ def summarise_ensemble(
     rounding_from = statistics.rounding_from if np.isfinite(statistics.rounding_from) else None
     names = ensemble_names(scenario)
     moments = statistics.quantities
-    values, errors = (
-        one.reshape(-1, len(names)) for one in (moments.mean, moments.standard_error())
-    )
+    values, errors = (x.reshape(-1, len(names)) for x in (moments.mean, moments.standard_error()))
     rows = node_rows(scenario, mean, mean_bounds(scenario, promised), error)
     quantities = quantity_rows(names, values, errors)
     *nodes, overall = (a | b for a, b in zip(rows, quantities, strict=True))

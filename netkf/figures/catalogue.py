@@ -64,8 +64,7 @@ def plot(result: Any, figure: str = "error") -> Picture:
 
     Of several runs and ensembles, in a list or by their labels in a mapping, it is ``error``: the
     mean square errors of all of them over time. If the result lacks the data of that figure, it
-    shows a sentence that says so. Raises ScenarioError for an unknown name, and if ``result`` is
-    not a result.
+    shows a sentence that says so. Raises ScenarioError for an unknown name or another ``result``.
     """
     return FigureSet(result).draw(figure)
 
@@ -128,8 +127,7 @@ class FigureSet:
 
 def plot_to_files(result: Any, names: tuple[str, ...], out: Path, file_format: str) -> list[Path]:
     """Write the figures of these names (default: all but slow ones) as ``out`` if that is a picture
-    file, else ``out``/NAME.``file_format``; return their paths. Raises ScenarioError and
-    WriteError.
+    file, else ``out``/NAME.``file_format``; return the paths. ScenarioError, WriteError.
     """
     figure_set = FigureSet(result)
     omit_slow = not names

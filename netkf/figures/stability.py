@@ -129,8 +129,7 @@ def _map_stable(scenario: Scenario, rates: Sequence[float]) -> np.ndarray:
 
 def sweep_figure(scenario: Scenario, table: Any, keys: Sequence[str], status: str) -> Picture:
     """Draw the largest RMS error of a ``table`` of ``netkf.sweep`` over one or two keys, and mark
-    points that diverged or have no bound. Raises UnavailableError for more keys, or without a
-    point.
+    points that diverged or have no bound. Raises UnavailableError for more keys or no point.
     """
     points = f"{scenario.name}: {len(table)} points"
     if status != "complete":
@@ -151,19 +150,17 @@ def sweep_figure(scenario: Scenario, table: Any, keys: Sequence[str], status: st
 
 
 def _draw_sweep_curves(axes: Any, table: Any, keys: list[str], unit: str) -> None:
-    positions, labels = _axis_positions(axes.set_xscale, table[keys[0]])
-    order = np.argsort(positions, kind="stable")
+    places, labels = _axis_positions(axes.set_xscale, table[keys[0]])
+    order = np.argsort(places, kind="stable")
     columns = (("worst_rms", "node with the largest error"), ("mean_rms", "all nodes"))
     for (column, label), series in zip(columns, SERIES, strict=False):
         bars = NORMAL_QUANTILE * table[f"{column}_se"].fillna(0.0).to_numpy()[order]
         style = {"color": series.colour, "ls": series.dashes, "marker": series.marker}
         errors = table[column].to_numpy()[order]
-        axes.errorbar(positions[order], errors, yerr=bars, label=label, ms=4, capsize=2, **style)
+        axes.errorbar(places[order], errors, yerr=bars, label=label, ms=4, capsize=2, **style)
     bound = np.sqrt(table["bound"].to_numpy(dtype=np.float64))[order]
     if np.isfinite(bound).any():
-        axes.plot(
-            positions[order], bound, color=EXACT, ls=":", marker="_", label="root of the bound"
-        )
+        axes.plot(places[order], bound, color=EXACT, ls=":", marker="_", label="root of the bound")
     if labels:
         # Long labels overlap unless they are tilted.
         rotation = 15 if sum(map(len, labels)) > 70 else 0

@@ -33,13 +33,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.runs.files import this_process, write_atomically
 from netkf.runs.labels import covariance_bias
 from netkf.runs.outcomes import downtimes
-from netkf.runs.summary import (
-    CONFIDENCE,
-    NO_COVARIANCE,
-    NORMAL_QUANTILE,
-    PromisedTraces,
-    nees_bounds,
-)
+from netkf.runs.summary import CONFIDENCE, NO_COVARIANCE, NORMAL_QUANTILE, nees_bounds
 
 BLUE, VERMILLION, GREEN, PURPLE, INK, ORANGE, SKY, MUTED = (one.colour for one in SERIES)
 FAINT = "#bbbbbb"
@@ -154,9 +148,7 @@ def _split_word(line: str, width: float, size: float, weight: str) -> list[str]:
 
 
 def label_text(text: object, most: int = 24) -> str:
-    """Return a name as one line of at most ``most`` characters for an axis or a legend, where
-    matplotlib takes dollar signs for formulas.
-    """
+    """Return a name as one line of up to ``most`` characters, its dollar signs no formulas."""
     return shorten(text, most).replace("$", r"\$")
 
 
@@ -358,25 +350,20 @@ def draw_covariances(axes: Any, data: FigureData) -> None:
         return
     root = np.sqrt(np.maximum(data.trace, 0.0))
     draw_nodes(axes, data, root, data.se_trace)
-    draw_promises(axes, data.times, data.promised)
+    if data.promised.bound is not None:
+        _draw_bound(axes, data.times, np.sqrt(data.promised.bound))
+    limits: tuple[tuple[float, str, Any], ...] = (
+        (data.promised.limit, data.promised.limit_label, "-."),
+        (data.promised.central, "centralised filter", (0, (6, 1, 1, 1, 1, 1))),
+    )
+    for value, label, style in limits:
+        if math.isfinite(value):
+            axes.axhline(math.sqrt(value), color=EXACT, ls=style, lw=1.1, label=label)
     bound = data.promised.bound
     set_scale(axes, root if bound is None else np.concatenate([root, np.sqrt(bound)]))
     axes.set(ylabel=f"{ROOT_TRACE}, {data.unit}", xlabel=SECONDS)
     shade_downtimes(axes, data)
     draw_legend(axes)
-
-
-def draw_promises(axes: Any, times: FloatArray, promised: PromisedTraces) -> None:
-    """Draw the roots of the bound over ``times`` (T,), its limit, and the central trace."""
-    if promised.bound is not None:
-        _draw_bound(axes, times, np.sqrt(promised.bound))
-    limits: tuple[tuple[float, str, Any], ...] = (
-        (promised.limit, promised.limit_label, "-."),
-        (promised.central, "centralised filter", (0, (6, 1, 1, 1, 1, 1))),
-    )
-    for value, label, style in limits:
-        if math.isfinite(value):
-            axes.axhline(math.sqrt(value), color=EXACT, ls=style, lw=1.1, label=label)
 
 
 def _draw_bound(axes: Any, times: FloatArray, roots: FloatArray) -> None:
@@ -430,9 +417,7 @@ def draw_nees(axes: Any, data: FigureData) -> None:
     if len(data.nodes) > 1:
         mean = values.mean(axis=1)
         axes.plot(data.times, mean, color=INK, lw=2.0, label="mean of all nodes", zorder=4)
-    ends = [
-        (size, np.array(nees_interval(size, runs)) * n / size) for size in np.unique(sizes).tolist()
-    ]
+    ends = [(s, np.array(nees_interval(s, runs)) * n / s) for s in np.unique(sizes).tolist()]
     for size, (low, high) in ends:
         label = f"{CONFIDENCE:.0%} if P is exact" + (f", n = {size}" if len(ends) > 1 else "")
         axes.axhspan(low, high, color=EXACT, alpha=0.15, lw=0, label=label)

@@ -17,10 +17,8 @@ FURTHEST = 3.0
 """Tolerances at which the axis ends."""
 
 
-MARKS, OTHER = (
-    {HOLDS: (style.EXACT, "o", "holds"), BROKEN: (style.LOST, "X", "BROKEN")},
-    (style.MUTED, "s", "undecided"),
-)
+MARKS = {HOLDS: (style.EXACT, "o", "holds"), BROKEN: (style.LOST, "X", "BROKEN")}
+OTHER = style.MUTED, "s", "undecided"
 """Colours, markers and names of verdicts."""
 
 

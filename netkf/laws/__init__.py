@@ -12,5 +12,4 @@ Counts = TypeVar("Counts", bound=tuple[Any, ...])
 
 def stack_runs(counts: Sequence[Counts]) -> Counts:
     """Return the ``counts`` of R runs, named tuples of arrays, as one with a first axis R."""
-    columns = zip(*counts, strict=True)
-    return type(counts[0])(*(np.array(column) for column in columns))
+    return type(counts[0])(*(np.array(column) for column in zip(*counts, strict=True)))

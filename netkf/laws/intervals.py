@@ -1,7 +1,6 @@
 """Confidence intervals that hold at a stated level for every number of samples.
 
-All samples are independent values. A level is the probability with which an interval may miss the
-truth.
+All samples are independent. A level is the probability with which an interval may miss the truth.
 """
 
 from __future__ import annotations
@@ -206,27 +205,21 @@ def with_drawn(interval: Interval, sample_factor: Callable[[float], float]) -> I
     return interval._replace(again=limits)
 
 
-def deviation_interval(expected: float, interval: Interval) -> Interval:
-    """Return the interval of |quantity - expected| from the ``interval`` of the quantity."""
-    covers = interval.low <= expected <= interval.high
-    ends = abs(interval.low - expected), abs(interval.high - expected)
+def deviation_interval(expected: float, one: Interval) -> Interval:
+    """Return the interval of |quantity - expected| from the ``one`` of the quantity."""
+    covers = one.low <= expected <= one.high
+    ends = abs(one.low - expected), abs(one.high - expected)
     low = 0.0 if covers else min(ends)
-    distance = abs(interval.value - expected)
+    distance = abs(one.value - expected)
     # A forecast keeps the estimate on the same side of the expected value, only nearer to it.
-    side = math.copysign(1.0, interval.value - expected)
+    side = math.copysign(1.0, one.value - expected)
 
     def limits(value: float, factor: float) -> tuple[float, float]:
-        ends = interval.limits(expected + side * value, factor)
+        ends = one.limits(expected + side * value, factor)
         return 0.0, max(abs(end - expected) for end in ends)
 
     return Interval(
-        distance,
-        low,
-        max(ends),
-        interval.detectable,
-        seen=interval.value,
-        expected=expected,
-        again=limits,
+        distance, low, max(ends), one.detectable, seen=one.value, expected=expected, again=limits
     )
 
 

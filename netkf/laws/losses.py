@@ -92,8 +92,7 @@ class LossLaw(NamedTuple):
 
 
 class LossCounts(NamedTuple):
-    """Counts of the messages of one run over D directions; of R runs with a first axis of that
-    length.
+    """Counts of the messages of one run over D directions; of R runs with a first axis.
 
     sent, lost : (W, D) messages in each of W equal windows of the run
     followed   : (D,) losses after which another message was sent
@@ -357,14 +356,12 @@ def mean_correlation(excess: FloatArray, variance: FloatArray, level: float) -> 
     spreads = (variance.sum(axis=1) ** 2 - (variance**2).sum(axis=1)) / 2.0
     total = float(spreads.sum())
     # The effective number of windows, those with few messages counting less.
-    effective_count = total**2 / float((spreads**2).sum()) if total > 0.0 else 0.0
-    if not effective_count >= MIN_RUNS:
+    effective = total**2 / float((spreads**2).sum()) if total > 0.0 else 0.0
+    if not effective >= MIN_RUNS:
         return None
     # Correlated losses have products of larger variance than independent ones.
     spread = math.sqrt(max(total, float((products**2).sum())))
-    return student_interval(
-        float(products.sum()) / scale, spread / scale, int(effective_count), level
-    )
+    return student_interval(float(products.sum()) / scale, spread / scale, int(effective), level)
 
 
 def compare_matchings(
@@ -454,12 +451,7 @@ def count_fixed(ages: FloatArray, fixed: float) -> DelayCounts:
 
 
 def count_delays(
-    law: WaitingLaw,
-    sent: FloatArray,
-    ages: FloatArray,
-    directions: IntArray,
-    size: int,
-    horizon: float,
+    law: WaitingLaw, sent: FloatArray, ages: FloatArray, links: IntArray, size: int, horizon: float
 ) -> DelayCounts:
     """Return the counts of K messages, in order of direction and number, ``sent`` (K,) and taking
     ``ages`` (K,) seconds, inf where under way at the ``horizon``.
@@ -467,9 +459,9 @@ def count_delays(
     ranks = censored_ranks(law, sent, ages, horizon)
     # The first message of each direction has no neighbour before it.
     first = np.ones(len(sent), dtype=bool)
-    first[1:] = directions[1:] != directions[:-1]
+    first[1:] = links[1:] != links[:-1]
     seen, centred = np.isfinite(ranks.rank), fill_in(ranks) - 0.5
-    sums = [np.bincount(directions[seen], w[seen], size) for w in (np.ones(len(sent)), centred)]
+    sums = [np.bincount(links[seen], w[seen], size) for w in (np.ones(len(sent)), centred)]
     products = correlate_neighbours(ranks, first)
     return DelayCounts(count_ranks(ranks), products, np.array(sums), np.array(0.0))
 

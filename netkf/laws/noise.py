@@ -73,9 +73,7 @@ class Whitening(NamedTuple):
 
 
 def whiten(S: FloatArray, share: float = 1e-12) -> Whitening:
-    """Return whitening factors of ``S`` without directions below a ``share`` of the largest, in
-    units of its rows.
-    """
+    """Return whitening factors of ``S``, in units of rows, without directions below ``share``."""
     sizes = np.diagonal(S)
     units = np.sqrt(np.where(sizes > 0.0, sizes, 1.0))
     values, vectors = np.linalg.eigh(symmetric(S) / units[:, None] / units)
@@ -125,14 +123,12 @@ def compare_variances(
     if counts.max(initial=0) < min_count:
         return NO_COMPARISON
 
-    def distance(square: float, kurtosis: float, count: float, level_part: float) -> Interval:
+    def distance(square: float, kurtosis: float, count: float, part: float) -> Interval:
         # The relative variance of a sum of squares is (kurtosis - 1) / count, that of chi-square
         # with f degrees of freedom 2 / f: hence f = 2 count / (kurtosis - 1). A sample kurtosis
         # below 3 counts as 3, which widens the interval.
         freedom = count if gaussian else 2.0 * count / max(kurtosis - 1.0, 2.0)
-        return deviation_interval(
-            1.0, scale_interval(freedom * square / count, freedom, level_part)
-        )
+        return deviation_interval(1.0, scale_interval(freedom * square / count, freedom, part))
 
     def kurtosis(squares: FloatArray, count: float) -> float:
         return count * float((squares**2).sum()) / max(float(squares.sum()) ** 2, 1e-300)
@@ -181,11 +177,9 @@ def compare_means(
     return LawComparison([*distances, *with_states], text)
 
 
-def _with_states(
-    states: FloatArray, labels: Sequence[str], level: float
-) -> list[tuple[Interval, str]]:
-    counts, products = states.sum(axis=0)
-    squares, runs = (states[:, 1] ** 2).sum(axis=0), (states[:, 0] > 0.0).sum(axis=0)
+def _with_states(x: FloatArray, labels: Sequence[str], level: float) -> list[tuple[Interval, str]]:
+    counts, products = x.sum(axis=0)
+    squares, runs = (x[:, 1] ** 2).sum(axis=0), (x[:, 0] > 0.0).sum(axis=0)
     comparable = np.argwhere((runs >= MIN_RUNS) & (squares > 0.0)).tolist()
     distances = []
     for j, i in comparable:
@@ -254,8 +248,7 @@ def compare_cells(u: FloatArray, labels: Sequence[str], level: float, noun: str)
     for column, label in enumerate(labels if len(labels) > 1 else ()):
         if counts[column] >= MIN_SEEN:
             for k, count in enumerate(cells[:, column].tolist()):
-                single = level / (2.0 * CELLS * len(labels))
-                found = cell_interval(count, counts[column], single)
+                found = cell_interval(count, counts[column], level / (2.0 * CELLS * len(labels)))
                 distances.append((found, f"{label}, {cell_label(k)}"))
     text = f"{counts.sum():,.0f} {noun}, largest difference of a share from 1/{CELLS}"
     return LawComparison(distances, text, overall=CELLS)

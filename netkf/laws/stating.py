@@ -61,8 +61,7 @@ def stated_part(part: Any, family: str) -> Any:
 
 def stated_law(part: Any, family: str) -> Any:
     """Return the ``gaps`` of a clock, ``chain`` of a loss or ``law`` of a delay; where a user's
-    class overrides another of the STATEMENTS the default, since what it inherits is of another
-    class.
+    class overrides another of the STATEMENTS the default, which states another class's law.
     """
     stated, name = stated_part(part, family), STATEMENTS[family][-1]
     own = _own_statements(stated, family)
@@ -72,9 +71,7 @@ def stated_law(part: Any, family: str) -> Any:
 
 
 def stating_class(part: Any, family: str, statement: str) -> str:
-    """Return what states the law of a part, as text: the class it derives from, or its own
-    ``statement``.
-    """
+    """Return as text what states a part's law: its base class, or its own ``statement``."""
     stated = stated_part(part, family)
     if type(stated) is type(part):
         return f"its `{statement}`"

@@ -95,8 +95,7 @@ def fill_in(ranks: Ranks) -> FloatArray:
 
 
 def correlate_neighbours(ranks: Ranks, first: np.ndarray) -> FloatArray:
-    """Return sums (3,) over neighbouring ranks u, v as normal numbers: of u v, of (u^2 + v^2) / 2,
-    and 1.
+    """Return sums (3,) over neighbouring ranks u, v, made normal: of u v, (u^2 + v^2) / 2, and 1.
 
     Pairs with nan, or with the ``first`` (K,) of a series, are left out; a rank beyond the known
     parts counts as the mean of what is beyond.
@@ -219,13 +218,11 @@ class TickSeries(NamedTuple):
         return np.where(self.number == 0, 0.0, np.concatenate([[0.0], self.times[:-1]]))
 
 
-def count_by_window(
-    times: FloatArray, indices: np.ndarray, size: int, horizon: float
-) -> np.ndarray:
+def count_by_window(times: FloatArray, index: np.ndarray, size: int, horizon: float) -> np.ndarray:
     """Return how often each of ``size`` indices occurs in W equal parts of a run, (W, size)."""
     windows = WINDOWS if size <= MAX_WINDOWED else 1
     flat_index = np.minimum((times * (windows / horizon)).astype(np.int64), windows - 1)
-    counts = np.bincount(flat_index * size + indices, minlength=windows * size)
+    counts = np.bincount(flat_index * size + index, minlength=windows * size)
     return counts.reshape(windows, size)
 
 
@@ -384,9 +381,7 @@ def count_interval(
 
 
 def compare_gaps(counts: TickCounts, level: float) -> tuple[LawComparison, LawComparison]:
-    """Compare the gaps of R runs with their law, and the correlation of neighbouring ones with 0;
-    each gets half of ``level``.
-    """
+    """Compare gaps of R runs with their law, and neighbours', at half of ``level`` each."""
     shares = compare_shares(counts.cells.sum(axis=0), level / 2.0, "gaps")
     correlation = neighbour_correlation(counts.products, level / 2.0)
     if correlation is None:

@@ -48,9 +48,7 @@ def any_struct(struct: Struct) -> Any:
 
 
 def viewed_as(cls: type[Struct], struct: Struct, **kinds: Any) -> Any:
-    """Return a struct as one of ``cls``, whose fields it has too, at the same places; some may have
-    other ``kinds`` than its own.
-    """
+    """Return a struct as one of ``cls``, whose fields it has at the same places."""
     if is_plain():
         return struct
     if not cls.struct_kinds:

@@ -14,9 +14,7 @@ MEMINFO, PARENT, ITEMS, ITEMSIZE, DATA, SHAPE, STRIDES = range(7)
 
 
 def entry_pointer(builder: Any, kind: Any, array: Any, indices: Any) -> Any:
-    """Emit the address of an entry of a C-contiguous array of numba type ``kind``; ``indices`` are
-    one nonnegative integer for each axis.
-    """
+    """Emit the address of a C-contiguous array's entry at ``indices``, one for each axis."""
     assert kind.layout == "C", f"{kind} is not contiguous"
     # A sum of products (and not Horner's scheme): LLVM hoists the terms of outer loops.
     offset, step = indices[-1], ir.Constant(I64, 1)
@@ -28,8 +26,7 @@ def entry_pointer(builder: Any, kind: Any, array: Any, indices: Any) -> Any:
 
 def array_without_owner(builder: Any, kind: Any, data: Any, shape: Any, itemsize: int) -> Any:
     """Emit a C-contiguous array structure of LLVM type ``kind`` without owner, and hence without
-    reference counting: from the address ``data``, the lengths ``shape`` and ``itemsize`` bytes per
-    entry.
+    reference counting: of address ``data``, lengths ``shape`` and ``itemsize`` bytes per entry.
     """
     strides = [ir.Constant(I64, itemsize)]
     # Row-major strides, from the last axis to the first.

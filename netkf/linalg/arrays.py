@@ -52,8 +52,7 @@ class _Entries(NamedTuple):
 
 def cached_by_entries(maxsize: int) -> Callable[[Callable[P, T]], Callable[P, T]]:
     """Return a decorator that keeps the last ``maxsize`` results of a function of arrays and of
-    values with a hash: arrays with the same entries, which the function must not write to, share
-    one.
+    values with a hash: arrays with the same entries, which it must not write to, share one.
     """
 
     def decorate(function: Any) -> Any:
@@ -100,9 +99,7 @@ def real_numbers(value: ArrayLike) -> FloatArray:
 
 
 def symmetric(matrices: FloatArray) -> FloatArray:
-    """Return the symmetric parts (..., n, n) of ``matrices``, one matrix (n, n) or a stack
-    (..., n, n).
-    """
+    """Return the symmetric parts (..., n, n) of ``matrices``, one or a stack."""
     return np.asarray(0.5 * (matrices + np.swapaxes(matrices, -1, -2)))
 
 
@@ -143,8 +140,7 @@ def square_root(matrix: FloatArray) -> FloatArray:
     the units of its rows; it may be singular.
     """
     sizes = np.diagonal(matrix)
-    exponents = np.frexp(np.where(sizes > 0.0, sizes, 1.0))[1] // 2
-    units = np.ldexp(1.0, exponents)
+    units = np.ldexp(1.0, np.frexp(np.where(sizes > 0.0, sizes, 1.0))[1] // 2)
     scaled = matrix / units[:, None] / units
     # Rows that are rounding of zero have no units: together they may be far from semidefinite.
     if np.linalg.eigvalsh(scaled)[0] < -1e-12:
@@ -186,9 +182,7 @@ def enlarged(array: FloatArray, *shape: int) -> FloatArray:
 
 
 def as_kernel_array(matrix: FloatArray) -> FloatArray:
-    """Return the matrix (r, c), or a copy, as a writable C-contiguous array, the only layout for
-    which kernels are compiled.
-    """
+    """Return the matrix (r, c) as a writable C-contiguous array, as kernels need; maybe a copy."""
     if matrix.flags.c_contiguous and matrix.flags.writeable:
         return matrix
     return np.array(matrix, order="C")
@@ -201,9 +195,7 @@ def upper_indices(n: int) -> tuple[IntArray, IntArray]:
 
 
 def from_upper(values: FloatArray, n: int) -> FloatArray:
-    """Return symmetric matrices (..., n, n) from their upper triangles ``values`` (..., u), row by
-    row.
-    """
+    """Return symmetric matrices (..., n, n) from upper triangles ``values`` (..., u) by row."""
     i, j = upper_indices(n)
     matrices = np.empty((*values.shape[:-1], n, n))
     matrices[..., i, j] = matrices[..., j, i] = values

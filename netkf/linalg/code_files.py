@@ -105,11 +105,9 @@ class CodeFiles:
 
     @property
     def _index_path(self) -> Path:
-        """The path of the index."""
         return self._folder / f"{self._base}.nbi"
 
     def _data_path(self, key: str) -> Path:
-        """Return the path of the code with a ``key``."""
         return self._folder / f"{self._base}.{key[:16]}.nbc"
 
     def _key(self, sig: Any, codegen: Any) -> str:
@@ -118,8 +116,7 @@ class CodeFiles:
 
         dumps: Any = serialize.dumps
         constants = dumps(_constants(self._function))
-        parts = [str(sig), *map(str, codegen.magic_tuple())]
-        texts = [part.encode() for part in parts]
+        texts = [part.encode() for part in [str(sig), *map(str, codegen.magic_tuple())]]
         return _digest(*texts, self._function.__code__.co_code, constants).hex()
 
     def _seal(self, index: bytes) -> bytes:

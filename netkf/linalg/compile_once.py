@@ -26,9 +26,7 @@ LOCK_FLAGS = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
 
 
 class SharedCache:
-    """A cache of a numba dispatcher with locks between processes; all other attributes are those
-    of the cache that it wraps.
-    """
+    """A numba dispatcher's cache with locks between processes, otherwise as it is."""
 
     def __init__(
         self, cache: Any, name: str, on_missing: Callable[[], None] = lambda: None

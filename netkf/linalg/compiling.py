@@ -162,14 +162,9 @@ class Kernel:
 
     def __init__(self, loops: Callable[..., Any], options: dict[str, Any]) -> None:
         """Wrap the Python function ``loops``; ``options`` are those of numba's njit."""
-        self._loops, self._options = loops, options
+        self.loops, self._options = loops, options
         self._entries: list[Any] = []
         update_wrapper(self, loops)
-
-    @property
-    def loops(self) -> Callable[..., Any]:
-        """The Python function."""
-        return self._loops
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Call the compiled function; the first call compiles it or loads it from disk."""
@@ -177,7 +172,7 @@ class Kernel:
 
     def __reduce__(self) -> str:
         """Return the name of the kernel in its module: pickle stores that, and not the code."""
-        return self._loops.__qualname__
+        return self.loops.__qualname__
 
     @cached_property
     def _kernel_dispatcher(self) -> Any:
@@ -190,7 +185,7 @@ class Kernel:
     def _python_dispatcher(self) -> Callable[..., Any]:
         """The numba dispatcher for calls by Python; cached on disk with all its callees."""
         dispatcher = self._new_dispatcher()
-        _if_numba_can(_compile_well, dispatcher, "_compile_for_args", self._loops)
+        _if_numba_can(_compile_well, dispatcher, "_compile_for_args", self.loops)
         return cast(Callable[..., Any], dispatcher)
 
     def compile_entry(self, arguments: tuple[Any, ...], returns_number: bool) -> int:
@@ -199,7 +194,7 @@ class Kernel:
         user's function that raises: C has no exceptions, and a run would go on with what is there;
         and for one that prints, which needs the interpreter's lock: a run may wait for it forever.
         """
-        require_quiet(self._loops, set())
+        require_quiet(self.loops, set())
         numba = require_numba()
         returned = numba.types.float64 if returns_number else numba.types.void
         kinds = tuple(map(numba.typeof, arguments))
@@ -207,20 +202,18 @@ class Kernel:
         try:
             from numba.core.ccallback import CFunc
 
-            entry: Any = CFunc(self._loops, (kinds, returned), {}, options)
-            _if_numba_can(_compile_well, entry, "compile", self._loops)
+            entry: Any = CFunc(self.loops, (kinds, returned), {}, options)
+            _if_numba_can(_compile_well, entry, "compile", self.loops)
             entry.compile()
         except (ImportError, AttributeError, TypeError):  # a private name of numba is missing
-            entry = numba.cfunc(returned(*kinds), **options)(self._loops)
+            entry = numba.cfunc(returned(*kinds), **options)(self.loops)
         self._entries.append(entry)
         return int(entry.address)
 
     def _new_dispatcher(self) -> Any:
-        """Return a numba dispatcher of the function."""
-        return require_numba().njit(**self._known_options())(self._loops)
+        return require_numba().njit(**self._known_options())(self.loops)
 
     def _known_options(self) -> dict[str, Any]:
-        """Return the options that this numba has."""
         return {name: self._options[name] for name in self._options.keys() - _unknown_options()}
 
 

@@ -30,13 +30,11 @@ def compile_function(function: Any, shapes: tuple[Any, Any, Any], takes_period: 
     def call_shortly(x: Any, u: Any, t: Any, _period: Any, out: Any) -> None:
         function(carray(x, of_x), carray(u, of_u), t, carray(out, of_out))
 
-    made = call if takes_period else call_shortly
-    return _numba.cfunc(_SIGNATURE, error_model="numpy")(made)
+    return _numba.cfunc(_SIGNATURE, error_model="numpy")(call if takes_period else call_shortly)
 
 
 @type_callable(call_function)
 def _type_call(_: Any) -> Any:
-    """Return the function that types a call: it returns nothing."""
     return lambda _address, _x, _u, _t, _period, _out: types.none
 
 
@@ -62,13 +60,11 @@ def _lower_call(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 @type_callable(call_at)
 def _type_call_at(_: Any) -> Any:
-    """Return the function that types a call: it returns nothing."""
     return lambda _address, _record, _h, _run: types.none
 
 
 @type_callable(call_at_two)
 def _type_call_at_two(_: Any) -> Any:
-    """Return the function that types a call: it returns nothing."""
     return lambda _address, _record, _h, _m, _run: types.none
 
 

@@ -27,7 +27,5 @@ def plain_address(function: Callable[..., None]) -> int:
 def call_function(
     address: int, x: FloatArray, u: FloatArray, t: float, period: float, out: FloatArray
 ) -> None:
-    """Write the value at ``x``, ``u``, ``t`` and ``period`` of the function with this ``address``
-    into ``out``, all C-contiguous.
-    """
+    """Write a function's value at ``x``, ``u``, ``t`` and ``period`` into ``out``, C-contiguous."""
     plain_functions[int(address)](x, u, t, period, out)

@@ -53,14 +53,11 @@ class Generic:
         return self.kernel_of(type(first))(first, *others)
 
     def __reduce__(self) -> str:
-        """Return the name in its module, which pickle stores."""
         return self.__qualname__  # type: ignore[attr-defined, no-any-return]
 
 
 def generic(function: Callable[..., Any]) -> Generic:
-    """Make a function of kernels whose implementations are registered by class; its own body is
-    not used.
-    """
+    """Make a function of kernels registered by class; its own body is not used."""
     return Generic(function)
 
 

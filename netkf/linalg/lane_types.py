@@ -206,16 +206,12 @@ class _Matrix:
             self._columns = builder.mul(self._columns, builder.extract_value(value, [SHAPE, axis]))
 
     def place(self, row: Any, column: Any, count: int) -> Any:
-        """Emit the address, as that of a vector, of ``count`` neighbours in ``row`` from ``column``
-        on.
-        """
+        """Emit the vector's address of ``count`` neighbours in ``row`` from ``column`` on."""
         offset = self._builder.add(self._builder.mul(row, self._columns), column)
         return _as_vector(self._builder, self._builder.gep(self._data, [offset]), DOUBLE, count)
 
     def lines(self, begin: Any, count: int) -> list[Any]:
-        """Emit the addresses, as those of vectors, of ``count`` rows of as many entries from row
-        ``begin`` on.
-        """
+        """Emit vectors' addresses of ``count`` rows of as many entries from ``begin`` on."""
         rows = [self._builder.add(begin, I64(k)) for k in range(count)]
         places = [self._builder.gep(self._data, [self._builder.mul(r, I64(count))]) for r in rows]
         return [_as_vector(self._builder, place, DOUBLE, count) for place in places]
@@ -284,9 +280,7 @@ def _scatter(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     begin = context.cast(builder, args[2], sig.args[2], types.intp)
     used = context.cast(builder, args[5], sig.args[5], types.intp)
     # After the transposition a vector has the entries of one lane, of which ``used`` are written.
-    values = _transposed(
-        builder, [builder.load(line, align=8) for line in rows.lines(begin, count)]
-    )
+    values = _transposed(builder, [builder.load(row, align=8) for row in rows.lines(begin, count)])
     indices = _entries_of(builder, sig.args[4], args[4], count)
 
     def write(width: int, first: Any) -> None:

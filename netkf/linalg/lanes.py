@@ -34,9 +34,7 @@ ONE: Lanes = (0,)
 
 
 def aligned(shape: tuple[int, ...], dtype: Any = np.float64) -> Any:
-    """Return an array of zeros of this ``shape`` in memory that begins at a line of the cache,
-    C-contiguous.
-    """
+    """Return C-contiguous zeros of this ``shape`` in memory that begins at a line of the cache."""
     size = math.prod(shape) * np.dtype(dtype).itemsize
     # numpy aligns to 16 bytes only: take more, and begin at the next line of the cache.
     memory = np.zeros(size + ALIGNMENT, dtype=np.uint8)
@@ -62,9 +60,7 @@ def with_spare(shape: tuple[int, ...], make: Callable[[tuple[int, ...]], Any] = 
 
 
 def blocks_of(runs: int, lanes: int = LANES) -> int:
-    """Return the number of blocks of so many ``lanes`` that hold the ``runs``; the last may have
-    idle lanes.
-    """
+    """Return the number of blocks of ``lanes`` for the ``runs``; the last may have idle lanes."""
     return -(-runs // lanes)
 
 
@@ -102,9 +98,7 @@ def _neighbours(lanes: Lanes, array: np.ndarray, place: tuple[int, ...]) -> Any:
 
 
 def load(lanes: Lanes, array: FloatArray, *place: int) -> Any:
-    """Return ``array[place]`` (L,) as one value of L lanes; ``place`` are the indices of all axes
-    but the last.
-    """
+    """Return ``array[place]`` (L,) as one value of L lanes; ``place``: all indices but the last."""
     if len(lanes) == 1:
         return array[place + (0,) * (array.ndim - len(place))]
     return _neighbours(lanes, array, place).view(Row).copy()
@@ -137,8 +131,7 @@ def scatter(
 ) -> None:
     """Transpose lanes back into rows of different places: write lane q of the ``count``, at most L,
     rows of ``rows`` (W, L) from ``first`` on into ``array[places[q]]`` of ``array`` (K, W), with K
-    places, where the place (L,) is not negative. The array may be a part ``whole[:, k]`` of
-    another.
+    places, where the place (L,) is not negative. The array may be a part ``whole[:, k]``.
     """
     known, last = places >= 0, first + min(count, len(lanes))
     taken = rows.reshape(-1, len(lanes))[first:last, known]
@@ -146,9 +139,7 @@ def scatter(
 
 
 def store(lanes: Lanes, array: FloatArray, *place_and_value: Any) -> None:
-    """Write a value of L lanes, the last argument, into ``array[place]`` (L,); a float into all
-    lanes.
-    """
+    """Write a value of L lanes, the last argument, or a float, into ``array[place]`` (L,)."""
     *place, value = place_and_value
     _neighbours(lanes, array, tuple(place))[:] = value
 

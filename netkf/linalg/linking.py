@@ -215,7 +215,6 @@ class _OwnCode:
     """
 
     def __init__(self, library: Any) -> None:
-        """Wrap a numba code ``library``."""
         self._library = library
 
     def __getattr__(self, name: str) -> Any:
@@ -272,8 +271,7 @@ def _with_all_called(library: Any) -> Any:
 
 def _finalize_without_code(library: Any) -> None:
     """Finalize an inner library, without optimising it or making machine code."""
-    defined = library._final_module.functions
-    _INNER_NAMES.update(f.name for f in defined if not f.is_declaration)
+    _INNER_NAMES.update(f.name for f in library._final_module.functions if not f.is_declaration)
     _UNLINKED.add(library)
     # Later callers that numba finalizes in its own way expect all callees in the module.
     library._get_module_for_linking = partial(_with_all_called, library)

@@ -31,8 +31,7 @@ def local_vector(size: Size, scratch: FloatArray) -> FloatArray:
 
 def local_lanes_matrix(size: Size, lanes: Lanes, scratch: FloatArray) -> FloatArray:
     """Return an uninitialised array (n, n, L) for L lanes, valid until the calling kernel returns:
-    on the stack if ``size`` is a tuple, else ``scratch`` (n, n, L). ``lanes`` is a tuple of length
-    L.
+    on the stack if ``size`` is a tuple, else ``scratch`` (n, n, L). ``lanes`` has length L.
     """
     return _local(size, scratch, len(size), len(size), len(lanes))
 

@@ -27,9 +27,7 @@ from netkf.linalg.local import (
 from netkf.linalg.structs import WORD
 
 
-def _register(
-    function: Callable[..., Any], dimensions: int, lanes: bool, more_columns: int = 0
-) -> None:
+def _register(function: Callable[..., Any], dimensions: int, lanes: bool, wider: int = 0) -> None:
     """Register a function of arrays with ``dimensions`` of n, and L with ``lanes``."""
 
     @type_callable(function)
@@ -53,7 +51,7 @@ def _register(
     def _on_stack(context: Any, builder: Any, sig: Any, _args: Any) -> Any:
         """Emit an array of constant shape in the stack frame of the calling function."""
         n, array_type = len(sig.args[0]), sig.return_type
-        shape = [n] * (dimensions - 1) + [n + more_columns]
+        shape = [n] * (dimensions - 1) + [n + wider]
         shape += [len(lane_tuple) for lane_tuple in sig.args[1:-1]]
         array = context.get_value_type(array_type)
         memory = cgutils.alloca_once(builder, ir.ArrayType(ir.DoubleType(), math.prod(shape)))
@@ -65,12 +63,11 @@ def _register(
 
     @lower_builtin(function, types.Array, *lane_types, types.Array)
     def _in_memory(_context: Any, _builder: Any, _sig: Any, args: Any) -> Any:
-        """Return the argument ``scratch``."""
         return args[-1]
 
 
 _register(local_matrix, 2, False)
 _register(local_vector, 1, False)
 _register(local_lanes_matrix, 2, True)
-_register(local_lanes_pair, 2, True, more_columns=1)
+_register(local_lanes_pair, 2, True, wider=1)
 _register(local_lanes_vector, 1, True)

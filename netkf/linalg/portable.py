@@ -24,9 +24,7 @@ SAME = 0.9
 
 
 def product(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return the product ``a b`` (..., r, c) of matrices ``a`` (..., r, m) and ``b``
-    (..., m, c).
-    """
+    """Return the product ``a b`` (..., r, c) of ``a`` (..., r, m) and ``b`` (..., m, c)."""
     if a.shape[-1] == 0:
         shape = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
         return np.zeros((*shape, a.shape[-2], b.shape[-1]))
@@ -54,9 +52,7 @@ def _product_of_blocks(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def apply(a: FloatArray, x: FloatArray) -> FloatArray:
-    """Return the product ``a x`` (..., r) of matrices ``a`` (..., r, m) and vectors ``x``
-    (..., m).
-    """
+    """Return the product ``a x`` (..., r) of ``a`` (..., r, m) and vectors ``x`` (..., m)."""
     if a.shape[-1] == 0:
         return np.zeros(np.broadcast_shapes(a.shape[:-1], (*x.shape[:-1], 1)))
     if x.ndim == 1:
@@ -79,9 +75,7 @@ def norm(x: FloatArray) -> FloatArray:
 
 
 def cholesky(matrix: FloatArray) -> FloatArray:
-    """Return the lower triangular ``L`` (n, n) with ``L L' = matrix``, which is (n, n) and positive
-    definite.
-    """
+    """Return lower triangular ``L`` (n, n), ``L L' = matrix``, of a positive definite one."""
     L = np.array(matrix, dtype=np.float64)
     for k in range(len(L)):
         # One outer product a step: every entry is reduced in the order of k, whatever the CPU.
@@ -92,9 +86,7 @@ def cholesky(matrix: FloatArray) -> FloatArray:
 
 
 def solve_lower(L: FloatArray, right: FloatArray) -> FloatArray:
-    """Return ``L^-1 right`` (..., n, c) of a lower triangular ``L`` (n, n) and ``right``
-    (..., n, c).
-    """
+    """Return ``L^-1 right`` (..., n, c) of lower triangular ``L`` (n, n) and ``right``."""
     out = np.array(right, dtype=np.float64)
     for k in range(len(L)):
         # Forward substitution by columns, so that numpy works on whole rows at once.
@@ -104,9 +96,7 @@ def solve_lower(L: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def eigenvectors(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the eigenvalues (n,) of a symmetric ``matrix`` (n, n), increasing, and its
-    eigenvectors, the columns of (n, n).
-    """
+    """Return eigenvalues (n,), increasing, and eigenvectors (columns) of symmetric ``matrix``."""
     A, V = np.ascontiguousarray(symmetric(matrix)), np.eye(len(matrix))
     # Diagonal matrices, which are frequent, need no compiled kernel.
     if np.count_nonzero(A - np.diag(A.diagonal())):
@@ -124,8 +114,7 @@ def _spectral(matrix: FloatArray, function: Callable[[FloatArray], FloatArray]) 
 def symmetric_root(matrix: FloatArray) -> FloatArray:
     """Return the symmetric square root (n, n) of a positive semidefinite ``matrix`` (n, n).
 
-    It is a continuous function of the matrix, unlike :func:`noise_root`, whose eigenvectors may
-    change abruptly.
+    It is a continuous function of the matrix, unlike :func:`noise_root` with its eigenvectors.
     """
     return _spectral(matrix, lambda values: np.sqrt(np.maximum(values, 0.0)))
 
@@ -136,9 +125,7 @@ def pseudo_inverse(matrix: FloatArray, rcond: float) -> FloatArray:
     """
 
     def invert(values: FloatArray) -> FloatArray:
-        """Return the reciprocals (n,) of the eigenvalues ``values`` (n,), 0 for those that count as
-        0.
-        """
+        """Return the reciprocals (n,) of eigenvalues, 0 for those that count as 0."""
         small = np.abs(values) <= rcond * np.abs(values).max(initial=0.0)
         return np.where(small, 0.0, 1.0 / np.where(small, 1.0, values))
 

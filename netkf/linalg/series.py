@@ -22,8 +22,7 @@ OCTAVES, STEPS = 8, 4  # gaps that are tried: halvings of the longest, and steps
 
 def exponential_terms(size: float) -> int:
     """Return the number of terms of the power series of exp(M), at least 8, that are needed for a
-    norm ``size`` of M: size^k / k!, which bounds the rest of the series from some k on, is then
-    below rounding.
+    norm ``size`` of M: size^k / k!, which bounds the rest of the series, is then below rounding.
     """
     terms, term = 1, 1.0
     while term > 1e-18 or terms < 8:
@@ -110,8 +109,7 @@ def add_terms(
     out: FloatArray, width: int, series: FloatArray, reach: FloatArray, column: int, gap: float
 ) -> None:
     """Write ``sum_k gap^k series[k]`` at ``gap`` (seconds) into ``out`` (width,), with as many
-    terms of ``series`` (terms, >= width) as ``reach`` (terms, ...) in this ``column`` requires for
-    the gap.
+    terms of ``series`` (terms, >= width) as ``reach`` (terms, ...) requires in this ``column``.
     """
     for j in range(width):
         out[j] = series[0, j]

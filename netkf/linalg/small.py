@@ -1,5 +1,4 @@
-"""Products and solutions of small matrices, as loops: at n = 2 to 16 a call of BLAS costs more than
-the arithmetic.
+"""Products and solutions of small matrices, as loops: at n = 2 to 16 BLAS costs more to call.
 
 All are kernels: other kernels and Python call them alike.
 """
@@ -50,8 +49,7 @@ def solve_inplace(L: FloatArray, out: FloatArray, n: int) -> None:
     """Replace the first ``n`` rows of ``out`` (>= n, c) by ``L^-1 out``, by Gaussian elimination
     with partial pivoting as in LAPACK; they become nan if L is singular.
 
-    L is any matrix (n, n), the first rows and columns of the argument (>= n, >= n), and is
-    overwritten.
+    L is a matrix (n, n), the first rows and columns of the argument, and is overwritten.
     """
     columns = out.shape[1]
     for k in range(n):
@@ -81,9 +79,7 @@ def solve_inplace(L: FloatArray, out: FloatArray, n: int) -> None:
 
 @kernel
 def largest_pivot(L: FloatArray, k: int, n: int) -> int:
-    """Return the row, from ``k`` to ``n`` - 1, with the largest absolute entry in column ``k`` of
-    ``L`` (>= n, >= n).
-    """
+    """Return the row from ``k`` to ``n`` - 1 with the largest absolute entry in column ``k``."""
     pivot = k
     for i in range(k + 1, n):
         if abs(L[i, k]) > abs(L[pivot, k]):
@@ -93,9 +89,7 @@ def largest_pivot(L: FloatArray, k: int, n: int) -> int:
 
 @kernel
 def swap_rows(a: FloatArray, i: int, k: int, first: int, last: int) -> None:
-    """Swap rows ``i`` and ``k`` of a matrix ``a`` (r, c) in place, from column ``first`` to
-    ``last`` - 1.
-    """
+    """Swap rows ``i`` and ``k`` of ``a`` (r, c) in place, from column ``first`` to ``last`` - 1."""
     for j in range(first, last):
         a[i, j], a[k, j] = a[k, j], a[i, j]
 

@@ -151,9 +151,7 @@ def balanced_norm(A: FloatArray) -> float:
     """Return the largest 1-norm of the balanced diagonal blocks of A (n, n): with at most n more
     terms than a number of this size, the power series of exp(A) is as accurate in each entry.
     """
-    return max(
-        (float(np.abs(one).sum(axis=0).max()) for one in _irreducible_blocks(A)), default=0.0
-    )
+    return max((float(np.abs(b).sum(axis=0).max()) for b in _irreducible_blocks(A)), default=0.0)
 
 
 def _irreducible_blocks(A: FloatArray) -> list[FloatArray]:

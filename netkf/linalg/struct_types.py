@@ -115,9 +115,7 @@ class Fields(AttributeTemplate):
 
     def generic_resolve(self, struct: StructType, name: str) -> Any:
         """Return the numba type of field ``name`` of a struct, None if there is no such field."""
-        return next(
-            (field_type for field_name, _, field_type in struct.fields if field_name == name), None
-        )
+        return next((kind for key, _, kind in struct.fields if key == name), None)
 
 
 def _field_pointer(builder: Any, address: Any, offset: int, llvm_type: Any) -> Any:
@@ -184,9 +182,7 @@ def lower_class_constant(context: Any, *_: Any) -> Any:
 
 @intrinsic
 def struct_from_memory(_: Any, memory: Any, kind: Any) -> Any:
-    """Type and emit the struct at the first word of ``memory``, of the class ``kind``, or of that
-    of the struct ``kind``.
-    """
+    """Type and emit the struct at ``memory`` of the class ``kind``, or of the struct ``kind``."""
     struct = kind.struct if isinstance(kind, ClassType) else kind
 
     def take_address(context: Any, builder: Any, sig: Any, args: Any) -> Any:

@@ -89,9 +89,7 @@ class Struct(metaclass=StructClass):
 
     @classmethod
     def of_size(cls, n: int) -> Any:
-        """Return the class of structs with a ``size`` of length n: a derived class of its own for n
-        up to MAX_UNROLLED, else this class.
-        """
+        """Return the structs' class for length n of ``size``: its own up to MAX_UNROLLED."""
         # Larger states share one compiled kernel, whatever their n.
         if n > MAX_UNROLLED:
             return cls
@@ -151,9 +149,7 @@ class Struct(metaclass=StructClass):
 
     @classmethod
     def at(cls, struct: Any) -> Any:
-        """Return a struct of this class for kernels, at the memory of another ``struct``, which it
-        keeps alive.
-        """
+        """Return a struct of this class at the memory of another one, which it keeps alive."""
         made = object.__new__(cls)
         made.__dict__.update(memory=struct.memory, address=struct.address, seen=struct)
         return made
@@ -165,8 +161,7 @@ class Struct(metaclass=StructClass):
         one for each of its dimensions.
         """
         last = cls.struct_fields[-1]
-        kind = cls.struct_kinds[last]
-        return cls.struct_offsets[last] + 1 + _dimensions(kind)
+        return cls.struct_offsets[last] + 1 + _dimensions(cls.struct_kinds[last])
 
     @classmethod
     def _lay_out(cls, values: dict[str, Any]) -> None:
@@ -224,16 +219,13 @@ class Struct(metaclass=StructClass):
         return self if is_plain() or cls is type(self) else cls.at(self)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return what pickle needs to make the struct again: its class, n and fields."""
         cls, size = type(self), getattr(self, "size", None)
         # A class made by of_size() has no importable name: its base and n are pickled.
         base, n = (cls.__base__, len(size)) if isinstance(size, tuple) else (cls, None)
         return _rebuilt, (base, n, {name: getattr(self, name) for name in self.struct_fields})
 
     def __getattr__(self, name: str) -> Any:
-        """Return the present value of a number, which ``memory`` holds; other fields are plain
-        attributes.
-        """
+        """Return the present value of a number, which ``memory`` holds, or an attribute."""
         # Numbers are read from the memory, where kernels may have changed them.
         kind = self.struct_kinds.get(name)
         if kind is not np.int64 and kind is not np.float64:
@@ -291,9 +283,7 @@ def sized(n: int) -> Size:
 
 
 def struct_at(memory: np.ndarray, cls: type[Derived]) -> Derived:
-    """Return, in kernels, the struct of class ``cls`` whose block of int64 words is ``memory``
-    (words,).
-    """
+    """Return, in kernels, the struct of ``cls`` whose int64 words are ``memory`` (words,)."""
     known: Any = _structs.get(array_address(memory))
     found: Derived = cls.from_memory(memory) if known is None else known
     return found

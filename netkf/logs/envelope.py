@@ -178,8 +178,7 @@ def compare_with_laws(
     range of ``runs`` runs of the law, by default as many as take about BUDGET seconds.
 
     If a law is true its runs and the replay are exchangeable: p is twice the smaller rank of the
-    replay among all of them, over their number; by Student's t where so few reject nothing by
-    ranks.
+    replay among all of them, over their number; by Student's t where ranks reject nothing.
     """
     simulate(scenario, scenario.seed, 0)  # what is compiled, or read, is so once
     begin = time.perf_counter()

@@ -139,7 +139,6 @@ def _span_of_all(folder: Path, poses: dict[Any, pd.DataFrame]) -> tuple[str, int
 
 
 def _read(path: Path, columns: Sequence[str]) -> pd.DataFrame:
-    """Return the rows of a file of numbers between blanks as texts, by line."""
     rows = dict[int, list[str]]()
     try:
         with path.open(encoding="utf-8-sig") as file:

@@ -194,10 +194,8 @@ def _read_rows(path: Path, raw: pd.DataFrame, notes: list[str]) -> _Rows:
             path, raw[names["number"]], wrong, rule, f"correct the entry, or {remedy}"
         )
     table["what"], table["heard"] = _read_outcomes(path, raw, names, table)
-    stamps, arrivals = (
-        packets.parse_stamps(path, raw, names["t"], notes),
-        _read_arrivals(path, raw, names),
-    )
+    stamps = packets.parse_stamps(path, raw, names["t"], notes)
+    arrivals = _read_arrivals(path, raw, names)
     has_receiver = (table["receiver"] != "").to_numpy()
     is_lost = has_receiver & np.array([arrival is None for arrival in arrivals])
     tells = names["t_heard"] and not (names["heard"] or names["event"])

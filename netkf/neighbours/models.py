@@ -89,11 +89,8 @@ def _dynamics(dt: Any, A: FloatArray, gain: FloatArray, noise: FloatArray) -> di
         fastest = float(np.abs(np.linalg.eigvals(A)).max()) or 1.0
         horizon = decimal_below(TIME_CONSTANTS / fastest)
         plant = {"kind": "diffusion", "A": A, "B": gain @ noise_root(noise)}
-        return {
-            "plant": plant,
-            "horizon": horizon,
-            "probe": float(Decimal(repr(horizon)) / SAMPLES),
-        }
+        probe = float(Decimal(repr(horizon)) / SAMPLES)
+        return {"plant": plant, "horizon": horizon, "probe": probe}
     table = _slots(1.0 if dt is True else dt)
     table["plant"] |= {"F": A, "Q": gain @ noise @ gain.T}
     return table

@@ -38,8 +38,7 @@ def export_perfetto(
 
     Each node is a process. Its track ``events`` has a slice for each instant at which something
     happens, named after the kinds of its events; its width means nothing. Messages that arrive are
-    arrows (flows) between slices; trace P and norm of error are counters. Instants are rounded to
-    nanoseconds.
+    arrows (flows) between slices; trace P and norm of error are counters. Rounded to nanoseconds.
 
     Raises ScenarioError for a window in which there is nothing, and WriteError.
     """
@@ -61,10 +60,7 @@ def export_perfetto(
         _counters(run, pids, begin, end),
     )
     about = {"scenario": run.scenario.name, "seed": run.seed, "replica": run.replica}
-    with (
-        write_atomically(path, this_process()) as temporary,
-        temporary.open("w", encoding="utf-8") as file,
-    ):
+    with write_atomically(path, this_process()) as part, part.open("w", encoding="utf-8") as file:
         file.write(f'{{"displayTimeUnit": "ms", "otherData": {json.dumps(about)},\n')
         file.write('"traceEvents": [\n')
         file.write(",\n".join(json.dumps(event, allow_nan=False) for event in events))

@@ -109,7 +109,7 @@ class BroadcastSampler:
         self._bad: bool | None = None
         self._random = generator("broadcast") if several and loss.fate_share > 0.0 else None
         of_sender = loss.stateful and loss.state_of == "sender"
-        self._state_random = generator("weather") if of_sender else None
+        self._switching = generator("weather") if of_sender else None
 
     def draw(self) -> BroadcastDraw:
         """Return what the hearers of the next broadcast share."""
@@ -123,12 +123,10 @@ class BroadcastSampler:
             # Two numbers for each, whether or not the fate is shared.
             numbers = self._random.random((count, 2))
             uniform = np.where(numbers[:, 0] < self._loss.fate_share, numbers[:, 1], np.nan)
-        if self._state_random is not None:
+        if self._switching is not None:
             bad = np.zeros(count, dtype=bool)
             for k in range(count):
-                self._bad = bad[k] = next_state(
-                    self._loss, self._link, self._bad, self._state_random
-                )
+                self._bad = bad[k] = next_state(self._loss, self._link, self._bad, self._switching)
         return BroadcastDraw(uniform, bad)
 
 
@@ -225,7 +223,7 @@ class ChannelSampler:
         self._bad: bool | None = None
         streams = {purpose: generator(purpose) for purpose in stream_purposes(channel)}
         self._loss_random = streams.get("loss")
-        self._state_random = streams.get("weather")
+        self._switching = streams.get("weather")
         self._delay_random = streams.get("delay")
 
     def draw(self) -> ChannelDraw:
@@ -234,17 +232,13 @@ class ChannelSampler:
         return ChannelDraw(float(uniform[0]), bool(bad[0]), float(delay[0]))
 
     def draws(self, count: int) -> tuple[FloatArray, np.ndarray, FloatArray]:
-        """Return uniform numbers, states (True: bad) and delays (s) of ``count`` activations,
-        (count,) each.
-        """
+        """Return uniforms, states (True: bad) and delays (s) of ``count`` activations, (count,)."""
         uniform, bad = np.zeros(count), np.zeros(count, dtype=bool)
         if self._loss_random is not None:
             uniform = self._loss_random.random(count)
-        if self._state_random is not None:
+        if self._switching is not None:
             for k in range(count):
-                self._bad = bad[k] = next_state(
-                    self._loss, self._link, self._bad, self._state_random
-                )
+                self._bad = bad[k] = next_state(self._loss, self._link, self._bad, self._switching)
         if self._delay_random is None:
             return uniform, bad, np.full(count, self._fixed_delay)
         return uniform, bad, draw_delays(self._delay, self._delay_random, count)

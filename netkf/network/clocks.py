@@ -121,9 +121,7 @@ class Poisson(LinkClock):
     )
 
     def __post_init__(self) -> None:
-        """Check the fields; raises ScenarioError for an entry of ``rates`` that does not fit
-        ``at``.
-        """
+        """Check the fields; raises ScenarioError for ``rates`` that do not fit ``at``."""
         super().__post_init__()
         length, rule = (2, _node_rate) if self.at == "nodes" else (3, _link_rate)
         for k, entry in enumerate(self.rates):
@@ -310,7 +308,6 @@ class Periodic(LinkClock):
     jitter: float = field(number(low=0.0), default=0.0)
 
     def __post_init__(self) -> None:
-        """Check the fields; raises ScenarioError if phase or jitter are not below the period."""
         super().__post_init__()
         for name in ("phase", "jitter"):
             value = getattr(self, name)

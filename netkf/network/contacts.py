@@ -42,7 +42,6 @@ class Contacts(LinkClock):
     grid_values: ClassVar[tuple[str, ...]] = ("_intervals",)
 
     def __post_init__(self) -> None:
-        """Check the fields and read the table; raises ScenarioError for a mistake in either."""
         super().__post_init__()
         if self.at == "nodes":
             rule = "must be links or directions: contacts have two ends"

@@ -76,9 +76,7 @@ class Delay(Component):
 
     @property
     def law(self) -> WaitingLaw | None:
-        """The law of the delays of independent messages in seconds; None if it is constant, or
-        unknown before a run.
-        """
+        """The law of independent delays (s); None if constant, or unknown before a run."""
         return None
 
     def message_delay(self, sent: Transmission, drawn: Any) -> Any:
@@ -145,7 +143,6 @@ class UniformDelay(Delay):
     high: float = field(of_time(number(low=0.0)))
 
     def __post_init__(self) -> None:
-        """Check the fields; raises ScenarioError if ``high`` is below ``low``."""
         super().__post_init__()
         if self.high < self.low:
             raise ScenarioError("high", "must be at least low", self.high, "swap the two")

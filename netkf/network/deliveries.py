@@ -17,9 +17,7 @@ from netkf.network.scheduled import Hopping
 
 
 class MessageKey(NamedTuple):
-    """The identity of a message: its directed link and its number on that link,
-    from 0.
-    """
+    """The identity of a message: its directed link and its number there, from 0."""
 
     sender: int
     receiver: int

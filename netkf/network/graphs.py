@@ -101,9 +101,7 @@ class Topology:
         return self.nodes[self.index[node]]
 
     def find(self, name: str) -> int | None:
-        """Return the id of the node with a name, which may be an id as text; None if no node has
-        it.
-        """
+        """Return the id of the node with a name, maybe an id as text; None if there is none."""
         node = self.names.get(name, _as_integer(name))
         return self.named(node) if node in self.index else None
 
@@ -134,8 +132,7 @@ class Topology:
     @cached_property
     def directions(self) -> tuple[Link, ...]:
         """The sorted pairs (sender, receiver): both directions of each link unless directed."""
-        pairs = self.direction_ends.tolist()
-        return tuple((self.nodes[i], self.nodes[j]) for i, j in pairs)
+        return tuple((self.nodes[i], self.nodes[j]) for i, j in self.direction_ends.tolist())
 
     @cached_property
     def direction_ends(self) -> np.ndarray:
@@ -336,8 +333,7 @@ class RandomGraph(Graph):
         # Limited in the number of graphs and in the nodes and edges of all of them.
         while tries < (MAX_TRIES if self.connected else 1) and entries < MAX_DRAWN:
             # networkx takes legacy generators only for its older functions.
-            state = np.random.RandomState((first_seed + tries) % 2**32)
-            graph = make(state)
+            graph = make(np.random.RandomState((first_seed + tries) % 2**32))
             tries, entries = tries + 1, entries + len(graph) + graph.number_of_edges()
             if not self.connected or networkx.is_connected(graph):
                 return graph
@@ -539,14 +535,11 @@ class RangeGraph(Graph):
     radius: float = field(positive)
 
     def build(self, seed: int) -> Topology:
-        """Return the topology that links all pairs; ``seed`` is not used. Raises ScenarioError
-        without nodes.
-        """
+        """Return the topology that links all pairs, whatever the ``seed``; raises ScenarioError."""
         if not self.nodes:
             remedy = "add nodes = N, or network.positions"
             raise ScenarioError("nodes", "is missing, and nothing is placed", None, remedy)
-        labels = range(self.nodes) if isinstance(self.nodes, int) else self.nodes
-        ids = assign_ids(labels)
+        ids = assign_ids(range(self.nodes) if isinstance(self.nodes, int) else self.nodes)
         _check_size(len(ids), len(ids) * (len(ids) - 1) // 2)
         names = {name: k for name, k in ids.items() if str(k) != str(name)}
         pairs = combinations(ids.values(), 2)
@@ -569,8 +562,7 @@ def _as_integer(label: Any) -> int | None:
 
 @dataclass(frozen=True)
 class LinkTable:
-    """The links of a file: the delivery ``probability`` of each direction that it lists, 1 where it
-    has none.
+    """The links of a file: the delivery ``probability`` of each listed direction, 1 without one.
 
     rows   : the use of the file's rows
     alone  : nodes that the file has without a link
@@ -599,7 +591,14 @@ class LinkTable:
         # Pairs listed from i to j only, in a table that lists others both ways.
         one_way = [] if self.directed else sorted(p for p in delivery if p[::-1] not in delivery)
         if self.has_probabilities and links.intersection(one_way):
-            raise self._unknown_direction(one_way)
+            raise ScenarioError(
+                "path",
+                f"{self.rows.path}: some links are listed in both directions and others in one, so "
+                "the probability of the other direction is not known",
+                _list_directions(one_way, self._label),
+                "list every link twice, or every link once (then the row counts both ways), or set "
+                "directed = true",
+            )
         nodes = _ends(links) | self.alone
         isolated = _ends(self.probability) - nodes
         _check_size(len(nodes), len(links))
@@ -634,16 +633,6 @@ class LinkTable:
             if p >= minimum and (self.directed or delivery.get(link[::-1], 0.0) >= minimum)
         }
 
-    def _unknown_direction(self, one_way: list[Link]) -> ScenarioError:
-        return ScenarioError(
-            "path",
-            f"{self.rows.path}: some links are listed in both directions and others in one, so "
-            "the probability of the other direction is not known",
-            _list_directions(one_way, self._label),
-            "list every link twice, or every link once (then the row counts both ways), or set "
-            "directed = true",
-        )
-
     def _label(self, node: int) -> str:
         return next((name for name, k in self.names.items() if k == node), str(node))
 
@@ -662,8 +651,7 @@ class CsvGraph(Graph):
     is undirected; nodes without a link are left out, and a note names them. If the table of an
     undirected graph lists every link once, each row counts in both directions. If it lists only
     some links in both directions, the other probabilities are unknown, and the table is refused
-    unless ``minimum`` drops those links. ``positions`` is a table whose first three columns are
-    node, x and y.
+    unless ``minimum`` drops those links. ``positions``: a table that begins with node, x and y.
     """
 
     may_name_nodes: ClassVar[bool] = True
@@ -756,6 +744,6 @@ def _one_way_note(pairs: list[Link], label: Callable[[int], str]) -> tuple[str, 
     return (f"links listed in one direction only left out: {_list_directions(pairs, label)}",)
 
 
-def _list_directions(pairs: list[Link], label: Callable[[int], str], max_listed: int = 3) -> str:
-    text = ", ".join(f"{label(i)} to {label(j)}" for i, j in pairs[:max_listed])
-    return text if len(pairs) <= max_listed else f"{text} and {len(pairs) - max_listed} more"
+def _list_directions(pairs: list[Link], label: Callable[[int], str]) -> str:
+    text = ", ".join(f"{label(i)} to {label(j)}" for i, j in pairs[:3])
+    return text if len(pairs) <= 3 else f"{text} and {len(pairs) - 3} more"

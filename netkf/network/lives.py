@@ -117,7 +117,6 @@ class DutyCycle(Life):
         return 2.0 / self.period
 
     def __post_init__(self) -> None:
-        """Check the fields; raises ScenarioError if a node would never be down."""
         super().__post_init__()
         if self.up >= self.period:
             remedy = "shorten it, or leave these nodes out"
@@ -203,9 +202,7 @@ class RecordedLife(Life):
 
 
 class Lifetime(NamedTuple):
-    """The changes of a node in a run, in canonical form; ``up`` at first; whether its ``memory`` is
-    lost when it goes down.
-    """
+    """A node's changes in canonical form; ``up`` at first; whether ``memory`` is lost when down."""
 
     up: bool
     changes: tuple[Change, ...]

@@ -121,9 +121,7 @@ class Loss(Component):
 
     @property
     def state_of(self) -> str:
-        """Whose the two states are: each "link" has its own, or each "sender", all of whose links
-        are in one state.
-        """
+        """Whose the two states are: each "link" has its own, or each "sender" for its links."""
         return "link"
 
     def next_state(self, link: Link, bad: bool | None, random: np.random.Generator) -> bool:
@@ -349,9 +347,7 @@ class GilbertElliott(Loss):
     shared: bool = field(boolean, default=False)
 
     def __post_init__(self) -> None:
-        """Check the fields; raises ScenarioError unless one of the two forms is given, and
-        possible.
-        """
+        """Check the fields; raises ScenarioError unless one form is given, and possible."""
         super().__post_init__()
         if self.path is not None and all(getattr(self, name) is None for name in _CHAIN):
             return
@@ -428,9 +424,7 @@ class GilbertElliott(Loss):
         return self._table[0].get(link, self)
 
     def check(self, topology: Topology) -> None:
-        """Raise ScenarioError unless every row of the table is of a link, and every link has a
-        chain.
-        """
+        """Raise ScenarioError unless each row is of a link, and each link has a chain."""
         chains, table, _ = self._table
         if table is None:
             return

@@ -69,9 +69,7 @@ class Matching(SlotActivation):
     p: float | None = field(number(above=0.0, high=1.0), default=None)
 
     def __post_init__(self) -> None:
-        """Check the fields; raises ScenarioError for a parameter of another protocol, or a missing
-        one.
-        """
+        """Check the fields; raises ScenarioError for a missing parameter or another protocol's."""
         super().__post_init__()
         for name, owner in (("lazy", "one-edge"), ("p", "independent")):
             if getattr(self, name) is not None and self.protocol != owner:
@@ -175,8 +173,7 @@ def _node_wakeup(topology: Topology, random: np.random.Generator) -> list[Link]:
 def _random_greedy(topology: Topology, random: np.random.Generator) -> list[Link]:
     """Return the maximal matching that takes links in a random order."""
     links = topology.links
-    order = random.permutation(len(links)).tolist()
-    return _choose_greedily([links[k] for k in order])
+    return _choose_greedily([links[k] for k in random.permutation(len(links)).tolist()])
 
 
 def _uniform_maximal(topology: Topology, random: np.random.Generator) -> list[Link]:
@@ -216,23 +213,21 @@ def maximal_matchings(links: tuple[Link, ...]) -> tuple[tuple[Link, ...], ...]:
 
 
 def _greedy_probabilities(links: tuple[Link, ...]) -> tuple[float, ...]:
-    count = len(links)
-    meets = [
-        sum(1 << b for b in range(count) if set(links[a]) & set(links[b])) for a in range(count)
-    ]
+    n = len(links)
+    meets = [sum(1 << b for b in range(n) if set(links[a]) & set(links[b])) for a in range(n)]
 
     @cache
     def probabilities(free: int) -> tuple[float, ...]:
         """Return p(free) = mean over a in ``free`` (a bit mask) of (1 at a) + p(free without a)."""
-        candidates = [a for a in range(count) if free >> a & 1]
-        total = [0.0] * count
+        candidates = [a for a in range(n) if free >> a & 1]
+        total = [0.0] * n
         for a in candidates:
             total[a] += 1.0
             for b, value in enumerate(probabilities(free & ~meets[a])):
                 total[b] += value
         return tuple(value / max(len(candidates), 1) for value in total)
 
-    return probabilities((1 << count) - 1)
+    return probabilities((1 << n) - 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,8 +247,7 @@ class RecordedSlots(SlotActivation):
     """Exchanges read from a table.
 
     Columns ``slot,node,peer`` are the pairs of matchings. Columns ``slot,phase,step,node,peer`` are
-    the links of broadcasts that were up, from node to peer, and in both directions if the graph is
-    undirected.
+    the links of broadcasts that were up, from node to peer, both ways if the graph is undirected.
     """
 
     path: SourceFile = field(source_file)

@@ -70,9 +70,7 @@ class NodeClock(Component):
 
 
 class NodeTime(NamedTuple):
-    """The clock of a node in one run, which shows ``offset + pace t`` seconds at time t, on the
-    ``grid`` of the scenario.
-    """
+    """A node's clock in one run: it shows ``offset + pace t`` at t (s), on the ``grid``."""
 
     grid: TimeGrid
     offset: float = 0.0

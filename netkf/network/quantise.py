@@ -59,9 +59,7 @@ class Quantisation(Component):
 def quantise_number(
     value: float, unit: float, step: float, limit: float, levels: float
 ) -> tuple[float, bool]:
-    """Return what is received of a number for which ``unit`` in [0, 1) was drawn, and whether it
-    was clipped.
-    """
+    """Return what is received of a number for ``unit`` in [0, 1), and if it was clipped."""
     dither = step * (unit - 0.5)
     level = np.floor((value + dither + limit) / step)
     kept = min(max(level, 0.0), levels - 1.0)

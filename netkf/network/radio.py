@@ -59,9 +59,7 @@ class Energy(Component):
 
 
 class Airtime:
-    """When the radios of nodes send, in one run. What a node is sending, or has waiting, when it
-    goes down is lost.
-    """
+    """When radios send in one run; what a node sends or has waiting as it goes down is lost."""
 
     def __init__(self, scenario: Any, streams: Any) -> None:
         self.radio: Radio = scenario.network.radio

@@ -53,8 +53,7 @@ class MessageTable:
 
     def value(self, link: Link, message: Any, after: str) -> Any:
         """Return the value of a message on ``link``, or of messages (K,), nan if it is not listed:
-        with ``after`` "repeat" the table starts again, with "refuse" ScenarioError is raised at
-        "path".
+        with ``after`` "repeat" the table starts again, "refuse" raises ScenarioError at "path".
         """
         numbers, values = self.values.get(link, _NOTHING)
         if after == "repeat" and link in self.values:
@@ -122,8 +121,7 @@ class _Recorded(Component):
 class RecordedLoss(_Recorded, Loss):
     """Outcomes read from a table ``sender,receiver,message,delivered`` (0 or 1).
 
-    Messages of a directed link are counted from 0; ``after`` is the treatment of a message that is
-    not listed.
+    Messages of a directed link are counted from 0; ``after``: the treatment of others.
     """
 
     independent = False
@@ -173,9 +171,7 @@ class RecordedDelay(_Recorded, Delay):
     @property
     def rows(self) -> FloatArray:
         """The delays (K,) of all listed messages in seconds."""
-        return np.concatenate(
-            [np.empty(0), *(seconds for _, seconds in self.table.values.values())]
-        )
+        return np.concatenate([np.empty(0), *(s for _, s in self.table.values.values())])
 
     @property
     def longest(self) -> float:

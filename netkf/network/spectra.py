@@ -71,6 +71,5 @@ def connected_parts(graph: Any, connection: Literal["strong", "weak"]) -> tuple[
     reached = (joined | joined.T if connection == "weak" else joined).astype(np.float32)
     for _ in range(len(graph).bit_length()):  # paths of twice the length
         reached = (reached @ reached > 0.0).astype(np.float32)
-    first = (reached * reached.T > 0.0).argmax(axis=1)
-    _, parts = np.unique(first, return_inverse=True)
+    _, parts = np.unique((reached * reached.T > 0.0).argmax(axis=1), return_inverse=True)
     return int(parts.max(initial=-1)) + 1, parts

@@ -134,9 +134,7 @@ class Block(Component):
 
 
 class Layout:
-    """The places of all blocks in the stacked state, in the order of ``[[plants]]`` and of their
-    nodes.
-    """
+    """The places of all blocks in the stacked state, in the order of ``[[plants]]`` and nodes."""
 
     def __init__(self, blocks: Sequence[Block]) -> None:
         """Raises ScenarioError for names and nodes that occur twice."""
@@ -150,9 +148,7 @@ class Layout:
         return self._by_key.get((name, node), self._by_key.get((name, None)))
 
     def require(self, name: object, node: int, whose: str = "") -> Place:
-        """Return the block ``name`` of ``node``, which messages call ``whose``; raises
-        ScenarioError without one.
-        """
+        """Return block ``name`` of ``node``, called ``whose``; raises ScenarioError without one."""
         if name not in self.names:
             listed = ", ".join(f'"{one}"' for one in self.names)
             remedy = f"{suggest_nearest(name, self.names)}names are {listed}"
@@ -174,9 +170,7 @@ class Layout:
         return tuple(place for place in self.places if place.node is None)
 
     def embed(self, parts: Iterable[tuple[Place, FloatArray]]) -> FloatArray:
-        """Return the matrix (p, n) of all states that has the given ones (p, n') at their blocks,
-        and zeros elsewhere.
-        """
+        """Return the matrix (p, n) with the given (p, n') at their blocks, and zeros elsewhere."""
         parts = list(parts)
         whole = np.zeros((len(parts[0][1]), self.n))
         for place, H in parts:
@@ -361,15 +355,12 @@ def _stacked_matrices(blocks: Sequence[Block], layout: Layout) -> dict[str, Any]
     """Return F and Q, or A and B, of all blocks together."""
     plants = _plants(blocks)
     names = ("F", "Q") if isinstance(plants[0], LinearPlant) else ("A", "B")
-    M, noise = (
-        block_diagonal([np.asarray(getattr(plant, name)) for plant in plants]) for name in names
-    )
+    M, noise = (block_diagonal([np.asarray(getattr(p, name)) for p in plants]) for name in names)
     _add_couplings(M, blocks, layout)
     return dict(zip(names, (M, noise), strict=True))
 
 
 def _stacked_schedule(blocks: Sequence[Block], layout: Layout) -> list[dict[str, Any]]:
-    """Return the changes of all blocks together."""
     plants: list[Any] = [block.plant for block in blocks]
     schedule = []
     for start in sorted({change.start for plant in plants for change in plant.schedule}):
@@ -444,9 +435,7 @@ def _stacked_input(blocks: Sequence[Block], layout: Layout) -> StackedInput | No
 
 def _check_gains(plant: Any) -> None:
     """Raise ScenarioError unless each G of a linear ``plant`` is that of its input."""
-    given = [
-        (f"schedule[{c}].G", one.G) for c, one in enumerate(plant.schedule) if one.G is not None
-    ]
+    given = [(f"schedule[{c}].G", p.G) for c, p in enumerate(plant.schedule) if p.G is not None]
     if plant.input is None:
         for key, G in given:
             rule = "belongs to a plant with an input"

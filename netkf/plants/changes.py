@@ -65,9 +65,7 @@ class RateChange(PlantChange):
 
 
 def schedule_of(cls: type[PlantChange]) -> Rule:
-    """Return the rule for a list of changes of class ``cls``, or tables of them, in the order of
-    their times.
-    """
+    """Return the rule for a list of changes of class ``cls``, or of tables, by their times."""
     fields = {f.name: f for f in dataclasses.fields(cls)}
     names = {FROM if name == "start" else name: name for name in fields}
     listed = ", ".join(names)
@@ -94,14 +92,9 @@ def schedule_of(cls: type[PlantChange]) -> Rule:
         return change
 
     keys = {key: dict(fields[name].metadata["rule"].schema) for key, name in names.items()}
-    schema = {
-        "type": "object",
-        "properties": keys,
-        "required": [FROM],
-        "additionalProperties": False,
-    }
+    form = {"type": "object", "properties": keys, "required": [FROM], "additionalProperties": False}
     remedy = f"write {{ {FROM} = 10.0, {[*names][1]} = ... }}"
-    entries = list_of(Rule("must be a table", convert_change, remedy, schema), "tables", 0)
+    entries = list_of(Rule("must be a table", convert_change, remedy, form), "tables", 0)
 
     def convert(value: Any) -> tuple[PlantChange, ...]:
         changes: tuple[PlantChange, ...] = entries.convert(value)

@@ -126,9 +126,7 @@ class NonlinearDiffusion(NonlinearStates):
 
 
 class CurvePath(WithoutFrames):
-    """The states of one run at some times, from x(0) = ``start`` (n,) on; see
-    ``NonlinearDiffusion.curve``.
-    """
+    """The states of one run at some times from ``start`` (n,) on; ``NonlinearDiffusion.curve``."""
 
     def __init__(
         self,
@@ -180,8 +178,7 @@ class CurvePath(WithoutFrames):
         pieces, (begin, stop) = [], ends
         for time in times:
             share = (time - begin) / (stop - begin)
-            normals = random.standard_normal(noise.shape)
-            first, noise = cut(noise, normals, share, stop - begin)
+            first, noise = cut(noise, random.standard_normal(noise.shape), share, stop - begin)
             pieces.append((begin, time, first))
             begin = time
         return [*pieces, (begin, stop, noise)]

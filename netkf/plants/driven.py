@@ -130,9 +130,7 @@ def _shift(
 
 
 class MovedFunction:
-    """What linearises the readings of a sensor, for estimates that are counted from ``m`` (n,), see
-    ``nonlinear.Linearised``.
-    """
+    """Linearises readings for estimates counted from ``m`` (n,), see ``nonlinear.Linearised``."""
 
     def __init__(self, function: Any, m: FloatArray) -> None:
         self._function, self._m = function, m
@@ -203,18 +201,14 @@ class MovedReadings:
         y, H = read_many(self._path, numbers, x + m)
         return y - apply(H, m), H
 
-    def whitened(
-        self, slots: Sequence[int], R: FloatArray, p: int
-    ) -> tuple[FloatArray, FloatArray]:
+    def whitened(self, slots: list[int], R: FloatArray, p: int) -> tuple[FloatArray, FloatArray]:
         """Return whitened readings (S, p) and H (S, p, n), see ``RecordedReadings``."""
         y, H = self._path.whitened(slots, R, p)
         return y - apply(H, self._m(slots)), H
 
 
 def moved_reading(y: FloatArray, H: Any, m: FloatArray) -> tuple[FloatArray, Any]:
-    """Return a reading y (p,) with H (p, n), or a function that linearises it, for states that are
-    counted from ``m`` (n,).
-    """
+    """Return a reading y (p,) with H (p, n), or a function, for states counted from ``m`` (n,)."""
     if not isinstance(H, np.ndarray):
         return y, MovedFunction(H, m)
     # A sensor without a reading may give an empty y, whatever H is.

@@ -68,7 +68,6 @@ class CustomDynamics(Component):
     part: Any
 
     def __eq__(self, other: object) -> bool:
-        """Return True if classes and attributes of both objects are equal."""
         if not isinstance(other, CustomDynamics):
             return NotImplemented
         mine, others = (getattr(one.part, "__dict__", {}) for one in (self, other))
@@ -76,11 +75,9 @@ class CustomDynamics(Component):
         return same and (self.part is other.part or str(mine) == str(others))
 
     def __hash__(self) -> int:
-        """Return a hash that equal dynamics share."""
         return hash(self.name)
 
     def __repr__(self) -> str:
-        """Return the name of the class."""
         return repr(self.name)
 
 
@@ -98,9 +95,7 @@ class BlockPart(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class StackedDynamics(Component):
-    """The dynamics of blocks side by side; by ``coupling`` (n, n), 0 within blocks, they drive each
-    other.
-    """
+    """Blocks' dynamics side by side; they drive each other by ``coupling`` (n, n)."""
 
     parts: tuple[BlockPart, ...]
     coupling: FloatArray

@@ -58,7 +58,6 @@ class Fault(Component):
         return None
 
     def __post_init__(self) -> None:
-        """Check the fields; raises ScenarioError for an end before the beginning."""
         super().__post_init__()
         if self.until is not None and self.until < self.since:
             raise ScenarioError("until", "must not be before since", self.until, "correct one")

@@ -144,7 +144,6 @@ class SineInput(Input):
     phase: FloatArray = field(_entries, default=0.0)
 
     def __post_init__(self) -> None:
-        """Check the fields; raises ScenarioError for a mistake in one, or for unequal lengths."""
         super().__post_init__()
         named = [(name, getattr(self, name)) for name in ("amplitude", "frequency", "phase")]
         m = max(len(value) for _, value in named)
@@ -186,7 +185,6 @@ class RecordedInput(Input):
     """The node (id) whose rows count."""
 
     def __post_init__(self) -> None:
-        """Check the fields and read the table; raises ScenarioError for a mistake in either."""
         super().__post_init__()
         if "node" not in self._columns:
             _ = self.exogenous
@@ -199,7 +197,6 @@ class RecordedInput(Input):
 
     @cached_property
     def _columns(self) -> Columns:
-        """All columns of the table."""
         m = sum(number_of(name, "u") >= 0 for name in read_header(self.path))
         names = [f"u{k}" for k in range(max(m, 1))]
         columns = read_columns(self.path, ("t", *names), ("node",))
@@ -227,9 +224,7 @@ class RecordedInput(Input):
 
     @cached_property
     def exogenous(self) -> Exogenous:
-        """The system whose output is u, which jumps at the rows; raises ScenarioError for two
-        values at one time.
-        """
+        """The system whose output u jumps at the rows; raises ScenarioError for two at one time."""
         u = self._table[1]
         rule = "there may be one row a time, or equal ones"
         first = first_rows(self.columns, self.row_keys, u.tolist(), rule)

@@ -133,8 +133,7 @@ def fill_impulses(
 ) -> None:
     """Write the response of x(end) and of the moments over [0, end] to an impulse of the noise at
     each of K ``instants`` (K,), in seconds, times the root of its ``weights`` (K,), into 3 n rows
-    of ``out`` (., K m) from ``row`` on. By Gauss quadrature ``out out'`` is the covariance of end
-    and moments.
+    of ``out`` (., K m) from ``row`` on. By Gauss quadrature ``out out'`` is the covariance.
     """
     n, m = B.shape
     for k in range(len(instants)):

@@ -240,8 +240,7 @@ class SlotReadings:
         offsets = np.array(slots) - self._slot - 1
         # ``apply`` handles the vectors one by one: readings have the same bits however many slots
         # are asked for together.
-        normals = self._noise.draws(int(offsets[-1]) + 1)[offsets]
-        noise = apply(self._root, normals)
+        noise = apply(self._root, self._noise.draws(int(offsets[-1]) + 1)[offsets])
         self._slot, self._v = slots[-1], noise[-1]
         return apply(H, x) + noise, H
 

@@ -55,9 +55,7 @@ class NonlinearStates(RecordedStates):
         return f, jacobian
 
     def functions_of(self, entries: np.ndarray) -> tuple[Any, np.ndarray]:
-        """Return f and its Jacobian of the blocks whose states are ``entries`` (n',), and the
-        numbers of their inputs (m',).
-        """
+        """Return f and Jacobian of blocks of ``entries`` (n',), and numbers of inputs (m',)."""
         stacked, inputs = self.f.chosen(entries)
         return functions_of(stacked, len(entries), len(inputs), self.in_slots), inputs
 
@@ -167,9 +165,7 @@ def _check_motion(plant: Any, motion: Any) -> None:
 
 
 class MapPath(WithoutFrames):
-    """The path of one run from x[0] = ``start`` (n,) on, with noise drawn from ``random``. Slots
-    must be asked for in order.
-    """
+    """The path of a run from x[0] = ``start`` (n,) on, drawn from ``random`` slot after slot."""
 
     def __init__(
         self, plant: NonlinearPlant, start: FloatArray, random: np.random.Generator

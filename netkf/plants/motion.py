@@ -51,9 +51,7 @@ def unicycle_jacobian(
 
 @kernel
 def unicycle_rate(x: FloatArray, u: FloatArray, _t: float, _period: float, out: FloatArray) -> None:
-    """Write the rate of change (3,) of the pose ``x`` (3,): u[0] is the speed, u[1] the turn
-    rate.
-    """
+    """Write the rate (3,) of the pose ``x`` (3,): u[0] is the speed, u[1] the turn rate."""
     out[0] = u[0] * math.cos(x[2])
     out[1] = u[0] * math.sin(x[2])
     out[2] = u[1]
@@ -97,9 +95,7 @@ def turn_slopes(w: float, period: float) -> tuple[float, float]:
 
 @kernel
 def move_turning(x: FloatArray, _u: FloatArray, _t: float, period: float, out: FloatArray) -> None:
-    """Write position, velocity and turn rate (5,) ``period`` seconds after ``x`` (5,), with the
-    turn rate held: speed is kept.
-    """
+    """Write position, velocity, turn rate (5,) ``period`` s after ``x`` (5,), turning as before."""
     a = x[4] * period
     along, aside = turn_integrals(x[4], period)
     c, s = math.cos(a), math.sin(a)

@@ -73,8 +73,7 @@ class Linearised:
 
     def __call__(self, y: FloatArray, xhat: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the reading ``y`` (p,) of a sensor linearised at the estimate ``xhat`` (n,):
-        ``y - h(xhat) + J xhat`` (p,) and the Jacobian J (p, n), which a linear filter uses as
-        reading and H.
+        ``y - h(xhat) + J xhat`` (p,) and the Jacobian J (p, n), a linear filter's reading and H.
         """
         J = jacobian_of(self._sensor, xhat, self._node)[self._present]
         return self.difference(y, self.value(xhat)) + J @ xhat, J
@@ -91,21 +90,17 @@ class Linearised:
 
 
 def linearise_by_points(
-    function: Any,
-    y: FloatArray,
-    xhat: FloatArray,
-    root: FloatArray,
-    points: tuple[float, float, float],
+    h: Any, y: FloatArray, xhat: FloatArray, root: FloatArray, points: tuple[float, float, float]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return a reading y (p,), its H (p, n) and a covariance (p, p) to add to that of its noise,
     with which the Kalman update is that of the sigma points: statistical linearisation of h at
-    ``xhat`` (n,) and the lower triangular ``root`` (n, n) of P. ``function`` is a Linearised or
+    ``xhat`` (n,) and the lower triangular ``root`` (n, n) of P. ``h`` is a Linearised or
     Stacked; ``points`` = (distance, weight, center) are a ``kernels.maps.Spread``.
     """
     distance, weight, center = points
-    middle = function.value(xhat)
+    middle = h.value(xhat)
     above, below = (
-        np.stack([function.difference(function.value(xhat + step), middle) for step in steps])
+        np.stack([h.difference(h.value(xhat + step), middle) for step in steps])
         for steps in (distance * root.T, -distance * root.T)
     )
     # Relative to the reading at xhat. G is the covariance of reading and state times S^-T.
@@ -118,7 +113,7 @@ def linearise_by_points(
     # P_yy - H P H': what is even in the deviations, while H P H' = G G' has all that is odd.
     even = above + below - 2.0 * mean
     extra = 0.5 * weight * even.T @ even + center * np.outer(mean, mean)
-    return function.difference(y, middle + mean) + H @ xhat, H, extra
+    return h.difference(y, middle + mean) + H @ xhat, H, extra
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,9 +184,7 @@ class NonlinearSensor(Sensor):
         """Raise ScenarioError if the sensor cannot read a state of n components."""
 
     def support(self, n: int, node: int) -> np.ndarray:
-        """Return the entries (k,) of a state of ``n`` that readings on ``node`` (id) depend on: by
-        default all.
-        """
+        """Return the entries (k,) of ``n`` that readings on ``node`` (id) depend on, here all."""
         return np.arange(n)
 
     def located(self, positions: dict[int, tuple[float, float]] | None) -> NonlinearSensor:
@@ -328,9 +321,7 @@ class PositionedSensor(NonlinearSensor):
         return self.rows
 
     def located(self, positions: dict[int, tuple[float, float]] | None) -> NonlinearSensor:
-        """Return the sensor with its nodes at the ``positions`` of the graph; raises ScenarioError
-        if it has none (None).
-        """
+        """Return the sensor with its nodes at ``positions``; raises ScenarioError for None."""
         if not isinstance(self.positions, str):
             return self
         if positions is None:
@@ -342,9 +333,7 @@ class PositionedSensor(NonlinearSensor):
             )
         # Nodes that the graph does not have are refused by name when the sensors are placed.
         nowhere = (0.0, 0.0)
-        return replace(
-            self, positions=np.array([positions.get(node, nowhere) for node in self.places])
-        )
+        return replace(self, positions=np.array([positions.get(k, nowhere) for k in self.places]))
 
     def check_state(self, n: int) -> None:
         """Raise ScenarioError if positions, states or R do not fit a state of ``n`` components."""

@@ -360,22 +360,15 @@ def set_part(
 
 @kernel(inlined=True)
 def fill_cubic(
-    cubic: FloatArray,
-    run: int,
-    row: int,
-    i: int,
-    length: float,
-    end: float,
-    plain: float,
-    tilted: float,
+    cubic: FloatArray, run: int, row: int, i: int, gap: float, end: float, plain: float, tilt: float
 ) -> None:
-    """Set ``cubic[run, row, :, i]``: the coefficients, times ``length``, of u, u^2 and u^3 of the
-    cubic that is 0 at u = 0 and ``end`` at u = 1, and has the moments ``plain`` and ``tilted``:
+    """Set ``cubic[run, row, :, i]``: the coefficients, times ``gap``, of u, u^2 and u^3 of the
+    cubic that is 0 at u = 0 and ``end`` at u = 1, and has the moments ``plain`` and ``tilt``:
     what the noise contributed to x.
     """
     # With e = length end, M_0 = plain and S_1 = 3 tilted these conditions give the coefficients
     # 6 M_0 - 10 S_1 + 3 e, 30 S_1 - 6 M_0 - 12 e and 10 e - 20 S_1.
-    last, slope = length * end, 3.0 * tilted
+    last, slope = gap * end, 3.0 * tilt
     cubic[run, row, 0, i] = 6.0 * plain - 10.0 * slope + 3.0 * last
     cubic[run, row, 1, i] = 30.0 * slope - 6.0 * plain - 12.0 * last
     cubic[run, row, 2, i] = 10.0 * last - 20.0 * slope
@@ -507,9 +500,7 @@ class DiffusionPath:
             k -= 1
 
     def local(self, time: float) -> FloatArray:
-        """Return x (n,) in the present frame at a grid, sample or probe ``time``; 0 at frame
-        times.
-        """
+        """Return x (n,) in the frame at a grid, sample or probe ``time``; 0 at frame times."""
         step = self._at(time)
         assert time in (step.start, step.end), f"{time} is neither on the grid nor probed"
         # The step that ends at the frame time is in coordinates of the previous frame.
@@ -629,23 +620,17 @@ def fill_integrals(out: FloatArray, course: FloatArray, first: float, last: floa
 
 @kernel(inlined=True, fused=True)
 def fill_moments_between(
-    lanes: Lanes,
-    size: Size,
-    out: FloatArray,
-    integrals: FloatArray,
-    width: int,
-    first: Any,
-    share: Any,
+    lanes: Lanes, size: Size, out: FloatArray, parts: FloatArray, width: int, first: Any, share: Any
 ) -> None:
     """Write the two moments of x over u in [first, first + share] of a piece into ``out`` (2, n,
-    L), from the ``integrals`` (2 W, L) that ``fill_integrals`` wrote; W = ``width``.
+    L), from the ``parts`` (2 W, L) that ``fill_integrals`` wrote; W = ``width``.
     """
     n, last = len(size), first + share
     # P_1 of the interval is (u - middle) scale. Row 0: int x. Row 1: int x P_1. The second integral
     # of the course still lacks a factor u: int x u = u (that value).
     middle, scale = first + 0.5 * share, 2.0 / share
     for i in range(n):
-        plain = load(lanes, integrals, width + i) - load(lanes, integrals, i)
-        late, early = load(lanes, integrals, width + n + i), load(lanes, integrals, n + i)
+        plain = load(lanes, parts, width + i) - load(lanes, parts, i)
+        late, early = load(lanes, parts, width + n + i), load(lanes, parts, n + i)
         store(lanes, out, 0, i, plain)
         store(lanes, out, 1, i, scale * (last * late - first * early - middle * plain))

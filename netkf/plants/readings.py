@@ -47,9 +47,7 @@ class NodeRows(NamedTuple):
     anchors: np.ndarray
 
     def covariance(self, k: int, R: FloatArray) -> FloatArray:
-        """Return the covariance (p', p') of the values of reading k: its own, else from R (p,
-        p).
-        """
+        """Return the covariance (p', p') of reading k: its own, else from R (p, p)."""
         present = np.flatnonzero(np.isfinite(self.y[k]))
         own = self.R[k] if len(self.R) else R
         chosen = np.ix_(present, present)
@@ -63,8 +61,7 @@ class NodeRows(NamedTuple):
 
 class ReadingTable:
     """A table of readings of p values each. ``regressors`` is the number n of columns phi, 0
-    without any, ``has_anchors`` says if there is a column ``to``, ``has_noise`` if rows bring their
-    own R.
+    without any, ``has_anchors`` tells of a column ``to``, ``has_noise`` of rows' own R.
 
     Mistakes in the file raise ScenarioError, at the latest when ``rows`` is called.
     """
@@ -148,9 +145,7 @@ class ReadingTable:
         without = missing.any(axis=(1, 2)) & ~given.any(axis=(1, 2)) & (self._R is not None)
         for k in np.flatnonzero(missing.any(axis=(1, 2)) & ~without).tolist():
             i, j = np.argwhere(missing[k])[0].tolist()
-            name = next(
-                name for name, pair in self._noise.items() if pair == (min(i, j), max(i, j))
-            )
+            name = next(name for name, p in self._noise.items() if p == (min(i, j), max(i, j)))
             rule = f"{self.columns.where(k)}: {name} is missing, and y{i} has a value"
             remedy = "write it" if i == j else "write it, 0 where two values do not correlate"
             raise ScenarioError("path", rule, None, remedy)
@@ -274,9 +269,7 @@ def slot_number(columns: Columns, row: int, period: float) -> int:
 
 
 class RecordedSamples:
-    """The readings of one node in continuous time, one sample each; ``matrix`` gives their H and n
-    the number of states.
-    """
+    """One node's readings in continuous time, one sample each, of n states with H ``matrix``."""
 
     def __init__(self, rows: NodeRows, matrix: Matrix) -> None:
         self._rows, self._matrix, self._is_uniform = rows, matrix, rows.is_uniform
@@ -311,8 +304,7 @@ class RecordedSamples:
 
 class RecordedReadings:
     """The readings of one node in slots: ``slots`` has the rows k of each; ``matrix`` gives the H
-    of a row, of n states (0: a function that linearises it). All rows of a slot are one stacked
-    reading.
+    of a row, of n states (0: a function that linearises it). Rows of a slot are one reading.
     """
 
     def __init__(self, rows: NodeRows, slots: dict[int, list[int]], matrix: Matrix, n: int) -> None:
@@ -364,9 +356,7 @@ class RecordedReadings:
             y[index, : len(values)], H[index, : len(values)] = values, self.matrix(slot)
         return y, H
 
-    def whitened(
-        self, slots: Sequence[int], R: FloatArray, p: int
-    ) -> tuple[FloatArray, FloatArray]:
+    def whitened(self, slots: list[int], R: FloatArray, p: int) -> tuple[FloatArray, FloatArray]:
         """Return readings (S, p) and matrices (S, p, n) of S ``slots``, multiplied by the inverse
         Cholesky factor of their noise covariance, where a sensor has R; zeros for what is missing,
         at the end of each row of the table: gates look at each by itself.
@@ -460,9 +450,7 @@ def readings_of(
 
 
 def read_many(path: Any, numbers: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return readings (S, p) and H (S, p, n) of S increasing ``numbers`` of samples or slots of a
-    ``path``, whose states are x (S, n).
-    """
+    """Return readings (S, p) and H (S, p, n) of ``numbers`` (S,), increasing, at x (S, n)."""
     if hasattr(path, "several"):
         y, H = path.several(numbers, x)
         return y, H

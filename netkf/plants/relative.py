@@ -117,9 +117,7 @@ class RelativeSensor(Sensor):
     def lowered(
         self, layout: Layout, pairs: Sequence[tuple[Place, Place]]
     ) -> list[LinearSensor | RecordedSensor]:
-        """Return the sensors of the stacked state that stand for it, of ``pairs`` of blocks, that
-        of the reader first.
-        """
+        """Return the stacked state's sensors that stand for it, of ``pairs``, the reader first."""
         matrices = {
             (own.node, other.node): layout.embed([(own, -H), (other, H)])
             for own, other in pairs
@@ -185,9 +183,7 @@ class RelativePositionSensor(PositionedSensor):
     def lowered(
         self, layout: Layout, pairs: Sequence[tuple[Place, Place]]
     ) -> list[RelativePositionSensor]:
-        """Return the sensors of the stacked state that stand for it, of ``pairs`` of blocks, that
-        of the reader first.
-        """
+        """Return the stacked state's sensors that stand for it, of ``pairs``, the reader first."""
         self.check_block(pairs[0][0].n if pairs else 0)
         places: dict[int | None, list[tuple[Place, Place]]] = {}
         for own, other in pairs:

@@ -24,14 +24,10 @@ class Samples(Protocol):
     """
 
     def reading(self, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``y`` (p,) and ``H`` (p, n) of sample number ``k``, at which the state is x (n,);
-        k must not decrease from call to call.
-        """
+        """Return ``y`` (p,) and ``H`` (p, n) of sample ``k``, not decreasing, at x (n,)."""
 
     def several(self, ks: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``y`` (S, p) and ``H`` (S, p, n) of the S samples with the increasing numbers
-        ``ks``, at which the states are x (S, n).
-        """
+        """Return ``y`` (S, p) and ``H`` (S, p, n) of samples ``ks``, increasing, at x (S, n)."""
 
 
 class DrawnSamples:
@@ -87,9 +83,7 @@ class RecordedSampling(Clock):
     def ticks(
         self, entity: Entity, origin: float, index: int, now: float, random: Generator, count: int
     ) -> FloatArray:
-        """Return up to ``count`` recorded times of the node ``entity[0]``, from number ``index``
-        on.
-        """
+        """Return ``count`` or fewer recorded times of ``entity[0]``, from number ``index`` on."""
         return self._times.get(entity[0], np.empty(0))[index : index + count]
 
 

@@ -5,8 +5,7 @@ from the sensor's own stream, as its two moments over each step, ``int dv`` (*pl
 ``int P_1 dv`` (*tilted*) with the Legendre polynomial P_1, -1 .. 1 over the step. At an
 event of the node inside a step, such as a tick or a message, the step is cut: the moments of the
 first part are drawn from their exact law given those of the whole, from a second stream, and the
-moments of the remaining part follow. The noise on the grid therefore does not depend on the
-network.
+moments of the remaining part follow. So noise on the grid does not depend on the network.
 """
 
 from __future__ import annotations
@@ -79,9 +78,7 @@ class Sensor(Component):
         return None
 
     def matrix_of(self, n: int) -> FloatArray:
-        """Return H (p, n) of the first reading, for a state of n components; the filters' models
-        are made with it before a run.
-        """
+        """Return H (p, n) of the first reading, of which filters' models are made before a run."""
         H: FloatArray = self.H  # type: ignore[attr-defined]
         return H
 
@@ -136,9 +133,7 @@ class LinearSensor(Sensor):
         return DrawnSamples(self.H, self.R, generator("noise"))
 
     def path(self, random: np.random.Generator, cutting: np.random.Generator) -> SensorPath:
-        """Return the increments of one run: ``random`` draws noise on the grid, ``cutting`` inside
-        it.
-        """
+        """Return a run's increments: ``random`` draws noise on the grid, ``cutting`` inside it."""
         return SensorPath(self.H, self.R, random, cutting)
 
     def slot_path(self, node: int, period: float, generator: Generators) -> SlotReadings:
@@ -152,16 +147,12 @@ class SensorPath:
     """
 
     def __init__(
-        self,
-        H: FloatArray,
-        R: FloatArray,
-        random: np.random.Generator,
-        cutting: np.random.Generator,
+        self, H: FloatArray, R: FloatArray, random: np.random.Generator, cuts: np.random.Generator
     ) -> None:
         self.H = H
         # The noise is drawn with unit intensity and multiplied by the Cholesky factor of R.
         self._root = cholesky(R)
-        self._cutting = cutting
+        self._cutting = cuts
         # Normals of the steps, and the end of the present one.
         self._normals, self._end = Blocks(random, 2 * len(R)), 0.0
         # Noise moments of the part of the present step that has not been read yet.
@@ -171,8 +162,7 @@ class SensorPath:
         self, truth: DiffusionPath, x_moments: FloatArray, start: float, end: float
     ) -> FloatArray:
         """Return the two moments (2, p) of dy over [start, end] seconds, inside the step that
-        ``truth`` was last asked for; ``start`` is the ``end`` of the last call. ``x_moments`` (2,
-        n).
+        ``truth`` was last asked for; ``start`` is the last ``end``. ``x_moments`` (2, n).
         """
         step_end = truth.step_end()
         # A new step: the previous one has been read to its end.
@@ -198,14 +188,12 @@ def step_noise(normals: FloatArray, period: float) -> FloatArray:
     return np.asarray(normals * np.sqrt(np.array([[period], [period / 3.0]])))
 
 
-def reading(
-    x_moments: FloatArray, H: FloatArray, noise: FloatArray, root: FloatArray
-) -> FloatArray:
+def reading(x: FloatArray, H: FloatArray, noise: FloatArray, root: FloatArray) -> FloatArray:
     """Return the two moments (2, p) of dy = H x dt + root dw over an interval, from those of x,
-    ``x_moments`` (2, n), and of unit white noise, ``noise`` (2, p); ``root`` (p, p).
+    ``x`` (2, n), and of unit white noise, ``noise`` (2, p); ``root`` (p, p).
     """
     out = np.empty(2 * len(H))
-    fill_reading(ONE, H[0], out, 0, len(H), x_moments, H[None], noise, root[None], 0)
+    fill_reading(ONE, H[0], out, 0, len(H), x, H[None], noise, root[None], 0)
     return out.reshape(2, len(H))
 
 
@@ -244,8 +232,7 @@ def cut(
     whole: FloatArray, normals: FloatArray, u: float, length: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the noise moments (2, p) of the first part of an interval, a share ``u`` of its
-    ``length`` in seconds, and of the rest, drawn with ``normals`` (2, p) given the ``whole`` (2,
-    p).
+    ``length`` in seconds, and of the rest, drawn with ``normals`` (2, p) given ``whole`` (2, p).
     """
     first, remaining = np.empty(whole.shape), whole.copy()
     divide(ONE, first, remaining, normals, u, length)

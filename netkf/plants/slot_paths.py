@@ -139,28 +139,21 @@ def draw_paths(
     states: np.ndarray,
     ziggurat: Ziggurat,
     slot: int,
-    scratch: FloatArray,
+    work: FloatArray,
     local: FloatArray,
     absolute: FloatArray,
 ) -> None:
     """Write the states of R runs in S slots from number ``slot`` on into ``local`` and, with
     frames, ``absolute``, both (B, S, n, L); move ``path`` behind these slots. ``states`` (R,
-    WIDTH), ``scratch`` (2, max(n, q), L).
+    WIDTH), ``work`` (2, max(n, q), L).
     """
     for b in range(local.shape[0]):
         first = b * len(lanes)
         for s in range(local.shape[1]):
             draw_normals(
-                lanes,
-                states,
-                first,
-                1,
-                len(states) - first,
-                ziggurat,
-                scratch[0],
-                path.root.shape[1],
+                lanes, states, first, 1, len(states) - first, ziggurat, work[0], path.root.shape[1]
             )
-            move_path(lanes, path, b, s, slot + s, scratch[0], local, absolute, scratch[1])
+            move_path(lanes, path, b, s, slot + s, work[0], local, absolute, work[1])
 
 
 class MapPaths(NamedTuple):

@@ -48,9 +48,7 @@ class StateTable:
 
     @cached_property
     def truth(self) -> RecordedTruth:
-        """The true state as engines read it; raises ScenarioError for two states at one time or in
-        one slot.
-        """
+        """The true state as engines read it; raises ScenarioError for two at one time or slot."""
         what = "time" if self._period is None else "slot"
         rule = f"there may be one row a {what}, or equal ones"
         first = first_rows(self.columns, self.row_keys, self._states.tolist(), rule)
@@ -67,9 +65,7 @@ class StateTable:
 
     @property
     def row_keys(self) -> list[int]:
-        """The subject of each row, in the order of the table: its slot, or its place among the
-        times of the table.
-        """
+        """The subject of each row, in order: its slot, or its place among the table's times."""
         columns = self.columns
         if self._period is None:
             order = np.argsort(columns["t"], kind="stable")
@@ -111,8 +107,7 @@ class StackedTruth(RecordedTruth):
 
 
 class StackedStates:
-    """The states of several blocks together, each by its plant: from its own table, drawn, or
-    unknown.
+    """The states of several blocks, each by its plant: from a table, drawn, or unknown.
 
     drawn, unknown : masks (n,) of entries
     """
@@ -206,9 +201,7 @@ class RecordedStates(Plant):
 
     @property
     def headings(self) -> tuple[int, ...]:
-        """The states that are angles, which tables may count from anywhere: of a built-in motion,
-        or those that a class names.
-        """
+        """States that are angles, which tables count from anywhere: a motion's, or a class's."""
         f = getattr(self, "f", None)
         if isinstance(f, str):
             return MOTIONS[f].headings

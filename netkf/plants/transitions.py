@@ -42,8 +42,7 @@ class Transitions:
         self._response = product(self._series, B)
 
     def laws(self, gaps: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``Phi`` and ``L``, both (K, n, n), of the K ``gaps`` (K,) in seconds, none below
-        0.
+        """Return ``Phi`` and ``L``, both (K, n, n), of K ``gaps`` (K,) in seconds, none below 0.
 
         Each gap is halved until the power series applies, then doubled:
         Phi(2 g) = Phi(g)^2 and L(2 g) L(2 g)' = [L, Phi L] [L, Phi L]'.
@@ -145,9 +144,7 @@ def frame_period(A: FloatArray) -> float | None:
 
 
 def decimal_below(bound: float) -> float:
-    """Return the largest 1, 2 or 5 times a power of ten that is at most ``bound``, up to
-    rounding.
-    """
+    """Return the largest 1, 2 or 5 times a power of ten up to ``bound``, but for rounding."""
     power = 10.0 ** math.floor(math.log10(bound))
     digit = next(d for d in (5.0, 2.0, 1.0) if d * power <= bound * (1.0 + 1e-9))
     # Rounded, since the product may differ from the decimal number in its last bit.

@@ -127,17 +127,8 @@ class Tree:
         states, offsets = np.empty((len(times), n)), np.zeros((frames, n))
         walk.x[0] = start
         ticks = np.rint(times * self._per_second).astype(np.int64)
-        fill_states(
-            sized(n),
-            self._cells,
-            ticks,
-            stream.copy(),
-            self._every,
-            normal_ziggurat(),
-            walk,
-            states,
-            offsets,
-        )
+        drawn = stream.copy(), self._every, normal_ziggurat()
+        fill_states(sized(n), self._cells, ticks, *drawn, walk, states, offsets)
         return states, offsets
 
 
@@ -248,9 +239,7 @@ def enter_cells(cells: Cells, walk: Walk, depth: int, tick: int) -> int:
 
 @kernel
 def divide_cell(size: Size, cells: Cells, walk: Walk, depth: int) -> None:
-    """Write the state and normals of that part of cell number ``depth`` of the ``walk`` that is the
-    next of it.
-    """
+    """Write state and normals of the next part of cell number ``depth`` of the ``walk``."""
     n, kind, inner, part = len(size), walk.kind[depth], depth + 1, walk.part[depth + 1]
     x, z = local_vector(size, walk.x[inner]), local_vector(size, walk.v[inner])
     for i in range(n):
@@ -334,8 +323,7 @@ def _completed(D: FloatArray) -> FloatArray:
         missing = np.flatnonzero(~rows[:, k].any(axis=1))
         others = rows if len(missing) == count else rows[missing]
         # The unit vector that is farthest from the rows so far, the first of those as far.
-        left = np.round(1.0 - taken[missing], 6)
-        row = np.eye(columns)[np.argmax(left, axis=1)]
+        row = np.eye(columns)[np.argmax(np.round(1.0 - taken[missing], 6), axis=1)]
         for _ in range(2):
             row = row - apply(np.swapaxes(others, 1, 2), apply(others, row))
         row /= norm(row)[:, None]

@@ -6,8 +6,7 @@ to zero at every *frame time* (a *rebase*), which starts a new *frame*. ``local`
 relative to the origin of the present frame, which moves with the plant; they keep the digits that
 ``absolute`` states lose as they grow.
 
-*Samples* are the times at which a sensor reads the state at an instant, *probes* those at which the
-run records it.
+*Samples* are the times at which a sensor reads the state, *probes* those at which it is recorded.
 """
 
 from __future__ import annotations
@@ -29,9 +28,7 @@ TOLERANCE = 1e-9  # seconds by which a recorded time may be off
 
 
 def multiples(period: float | None, horizon: float, grid: TimeGrid) -> FloatArray:
-    """Return the multiples (K,) of ``period`` (None: none) in (0, horizon), seconds, on the
-    ``grid``.
-    """
+    """Return the multiples (K,) of ``period`` or None in (0, horizon) s, on the ``grid``."""
     if period is None or period >= horizon:
         return np.empty(0)
     times = grid.snap(period * np.arange(1, int(horizon / period) + 2))
@@ -112,9 +109,7 @@ class SampledTruth:
         return np.asarray(self.offsets[k])
 
     def states(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return local and absolute states (K, n) each at ``times`` (K,) of the path, in any
-        order.
-        """
+        """Return local and absolute states (K, n) at ``times`` (K,) of the path, in any order."""
         indices = np.searchsorted(self._times, times)
         return self._local[indices], self._absolute[indices]
 
@@ -211,8 +206,7 @@ def nearest_row(times: FloatArray, time: float) -> int | None:
 
 def demand_states(source: SourceFile, truth: RecordedTruth, needed: FloatArray, use: str) -> None:
     """Raise ScenarioError for the first of the ``needed`` times (M,), in seconds, at which the
-    ``truth`` of the table in the file ``source`` is unknown; ``use`` says in the message what the
-    state is for.
+    ``truth`` of the table in the file ``source`` is unknown; ``use`` says what it is for.
     """
     for time in needed.tolist():
         if truth.rows_at(time):

@@ -217,7 +217,6 @@ def _explain_worst(
 
 
 def _describe_start_up(worst: WorstSample, later: WorstSample, start: StartUp) -> str:
-    """Return sentences saying that ``later`` is explained, as the worst is in the start-up."""
     sentence = (
         f"The filters had just started at {_format_time(worst.time)}: trace P was "
         f"{format_number(start.now)}, {format_number(start.first)} at the first sample and "
@@ -264,14 +263,10 @@ def _describe_last_messages(
         link = received[(received["sender"] == sender) & (received["sent"] <= cutoff)]
         arrived = link[(link["outcome"] == DELIVERED) & (link["ended"] <= cutoff)]
         last_sent = float(arrived["sent"].max()) if len(arrived) else -math.inf
-        lost = link[(link["sent"] > last_sent) & np.isin(link["outcome"], (LOST, LATE))]
-        missing += len(lost)
+        missing += len(link[(link["sent"] > last_sent) & np.isin(link["outcome"], (LOST, LATE))])
         ages.append((max(0.0, worst.time - last_sent), sender))
     heard = sorted((entry for entry in ages if math.isfinite(entry[0])), reverse=True)
-    oldest = [
-        f"node {label(sender)} ({format_number(age)} s before)"
-        for age, sender in heard[:MAX_LISTED]
-    ]
+    oldest = [f"node {label(s)} ({format_number(age)} s before)" for age, s in heard[:MAX_LISTED]]
     listed = "it had last heard " + ", ".join(oldest) if oldest else "it had heard no node"
     if len(heard) > MAX_LISTED:
         listed += f" (the {MAX_LISTED} oldest of {len(heard)} links)"
@@ -298,13 +293,11 @@ def _compare_delivery(messages: np.ndarray, received: np.ndarray) -> str:
     )
 
 
-def _judge_age(
-    source: ReportSource, run: StoredRun, received: np.ndarray, worst: WorstSample
-) -> str:
+def _judge_age(source: ReportSource, run: StoredRun, heard: np.ndarray, worst: WorstSample) -> str:
     """Return whether the node's information was unusually old at its worst sample, or ""."""
     # The latest arrivals (T,) that the estimates sampled at ``run.times`` (T,) include, in seconds.
     cutoffs = source.cutoffs(run.times)
-    ages: FloatArray = information_age(received, (worst.node,), run.times, cutoffs)[:, 0]
+    ages: FloatArray = information_age(heard, (worst.node,), run.times, cutoffs)[:, 0]
     age = ages[int(np.searchsorted(run.times, worst.time))]
     later_ages = ages[run.times > 0.0]
     # Without any arrival the age is the time since the start, which says nothing new.

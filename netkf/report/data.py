@@ -66,8 +66,7 @@ def describe_innovations(readings: Innovations, scenario: Scenario) -> str:
     """Return a sentence on the nodes' mean NIS, and on how many contradict P."""
     ids, means, low, high = node_means(readings)
     nodes = [scenario.topology.named(k) if k >= 0 else k for k in ids.tolist()]
-    count = int(np.isfinite(readings.nis).sum())
-    sentence = f"Over {count:,} readings"
+    sentence = f"Over {int(np.isfinite(readings.nis).sum()):,} readings"
     if readings.increments:
         all_are = readings.increments == len(readings.nis)
         share = "which are" if all_are else f"{readings.increments:,} of them"

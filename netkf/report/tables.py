@@ -215,7 +215,6 @@ def sweep_table(source: ReportSource) -> str:
 
 
 def _format_cell(value: Any, error: Any) -> str:
-    """Return a value of a sweep as text, a number with its standard error (None if it has none)."""
     if isinstance(value, (int, np.integer)):
         return f"{int(value):,}"
     if isinstance(value, (float, np.floating)):

@@ -5,8 +5,7 @@ many streams, and to make a numpy generator for each takes longer than to draw f
 a row of 64-bit words (``rng.streams``). Exponentials come from the ziggurat of Marsaglia and Tsang
 (2000) with numpy's tables (``ziggurat_constants.h``, BSD-3-Clause), stored in ``ziggurat.npz``.
 
-Arrays ``states`` (K, WIDTH) are the states of K streams, which drawing advances. All arithmetic is
-modulo 2^64.
+Arrays ``states`` (K, WIDTH) are the states of K streams, which drawing advances, modulo 2^64.
 """
 
 from __future__ import annotations
@@ -99,9 +98,7 @@ def next_unit(states: np.ndarray, k: int) -> float:
 
 @kernel
 def next_exponential(states: np.ndarray, k: int, ziggurat: Ziggurat) -> float:
-    """Return the next number of stream ``k`` of the ``states`` (K, WIDTH) from the exponential law
-    of mean 1 (ziggurat).
-    """
+    """Return the next number of stream ``k`` from the exponential law of mean 1 (ziggurat)."""
     while True:
         # 8 bits choose a layer, 53 bits a point across it.
         word = next_word(states, k) >> S3
@@ -121,8 +118,6 @@ def next_exponential(states: np.ndarray, k: int, ziggurat: Ziggurat) -> float:
 
 @kernel
 def fill_units(states: np.ndarray, out: FloatArray) -> None:
-    """Write the next uniform number of each of the streams ``states`` (K, WIDTH) into ``out``
-    (K,).
-    """
+    """Write the next uniform number of each of ``states`` (K, WIDTH) into ``out`` (K,)."""
     for k in range(len(out)):
         out[k] = next_unit(states, k)

@@ -32,9 +32,7 @@ class GeneratorNormals:
 
 
 class StreamNormals:
-    """The streams with these ``states`` (K, WIDTH), drawn in compiled code: the same numbers as
-    their numpy generators.
-    """
+    """Streams ``states`` (K, WIDTH) in compiled code: the same numbers as numpy's generators."""
 
     def __init__(self, states: np.ndarray) -> None:
         self.states = states
@@ -48,9 +46,7 @@ class StreamNormals:
 
 @kernel
 def fill_normals_of_all(states: np.ndarray, ziggurat: Ziggurat, out: FloatArray) -> None:
-    """Write the next M standard normal numbers of stream k of the ``states`` (K, WIDTH) into
-    ``out[k]``, for all k; ``out`` is (K, M).
-    """
+    """Write the next M standard normals of each of ``states`` (K, WIDTH) into ``out`` (K, M)."""
     for k in range(out.shape[0]):
         for m in range(out.shape[1]):
             out[k, m] = next_normal(states, k, ziggurat)

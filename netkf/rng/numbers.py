@@ -4,8 +4,7 @@
 come from the ziggurat of Marsaglia and Tsang (2000) with numpy's 256 layers
 (``ziggurat_normal.npz``), gamma numbers from their transformed normals (ACM TOMS 26, 2000) or, of
 shapes below 1, from exponentials (Ahrens and Dieter 1974), integers from Lemire's method (ACM
-TOMACS 29, 2019) and permutations from masked 32-bit halves of words. tests/rng compares all of them
-with numpy.
+TOMACS 29, 2019) and permutations from masked 32-bit halves of words, all tested against numpy.
 """
 
 from __future__ import annotations
@@ -73,9 +72,7 @@ def next_normal(states: np.ndarray, k: int, ziggurat: Ziggurat) -> float:
 def next_gamma(
     states: np.ndarray, k: int, shape: float, exponential: Ziggurat, normal: Ziggurat
 ) -> float:
-    """Return the next number of stream ``k`` of the ``states`` (K, WIDTH) from the gamma law of
-    this ``shape`` > 0 and scale 1.
-    """
+    """Return stream ``k``'s next number from the gamma law of ``shape`` > 0 and scale 1."""
     if shape == 1.0:
         return float(next_exponential(states, k, exponential))
     while shape < 1.0:

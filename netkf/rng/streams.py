@@ -49,8 +49,7 @@ class Streams:
         integers, such as a node id or the two ends of a link.
         """
         key, counter = _key_and_counter(self.seed, self.replica, _purpose_code(purpose), entity)
-        bits = cast(Any, np.random.Philox)
-        return np.random.Generator(bits(_Key(key), counter=counter))
+        return np.random.Generator(cast(Any, np.random.Philox)(_Key(key), counter=counter))
 
     @property
     def per_replica(self) -> tuple[Streams, ...]:
@@ -113,8 +112,7 @@ def _key_and_counter(
 @lru_cache(maxsize=1024)
 def _key(seed: int, name: tuple[int, ...] = ()) -> np.ndarray:
     """Return the key (2,) that numpy makes of a seed and the ``name`` of a stream."""
-    words = np.random.SeedSequence(seed, spawn_key=name).generate_state(2, np.uint64)
-    return np.asarray(words)
+    return np.asarray(np.random.SeedSequence(seed, spawn_key=name).generate_state(2, np.uint64))
 
 
 @lru_cache(maxsize=32)

@@ -111,9 +111,7 @@ def fate_matrix(outcomes: Outcomes, size: int) -> FloatArray:
 def loss_windows(
     outcomes: Outcomes, size: int, edges: FloatArray
 ) -> tuple[list[tuple[int, int]], FloatArray]:
-    """Return the links (indices) that sent, and the share lost between ``edges`` (B + 1,) in
-    seconds, (L, B), nan where nothing was sent.
-    """
+    """Return links that sent, and shares lost (L, B) between ``edges`` (B + 1,) s, or nan."""
     codes, link = np.unique(outcomes.sender * size + outcomes.receiver, return_inverse=True)
     bins = np.clip(np.searchsorted(edges, outcomes.sent, side="right") - 1, 0, len(edges) - 2)
     cell, count = link * (len(edges) - 1) + bins, len(codes) * (len(edges) - 1)
@@ -170,8 +168,7 @@ class Transmissions:
 
     In continuous time a broadcast has a ``transmit`` row; without such rows every message is a
     transmission by itself. In slots all messages of a node in one step of an exchange are one
-    transmission. Messages and transmissions are counted by node and phase, which is -1 under
-    clocks.
+    transmission. All are counted by node and phase, which is -1 under clocks.
     """
 
     def __init__(self) -> None:

@@ -192,7 +192,6 @@ class ParquetSink(Sink):
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        """Finish the files, or remove them after an exception."""
         try:
             if error is None:
                 self.close()

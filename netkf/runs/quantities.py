@@ -117,16 +117,12 @@ class NetworkSink(Sink):
     thread_safe: ClassVar[bool] = True
 
     def __init__(
-        self,
-        scenario: Scenario,
-        seed: int,
-        replica: int,
-        transmissions: Transmissions | None = None,
+        self, scenario: Scenario, seed: int, replica: int, sent: Transmissions | None = None
     ) -> None:
         self._scenario = scenario
         self.connectivity = ConnectivitySink(scenario, lifetimes(scenario, Streams(seed, replica)))
-        self._counts_own = transmissions is None
-        self._transmissions = transmissions or Transmissions()
+        self._counts_own = sent is None
+        self._transmissions = sent or Transmissions()
         self._ages = _make_ages(scenario)
         self._last = 0.0
 

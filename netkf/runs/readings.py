@@ -79,9 +79,7 @@ def collect_readings(
         for key, ks in numbers.items()
     }
     times = np.unique(np.concatenate([np.empty(0), *times_of.values()]))
-    drawn = any(
-        scenario.sensors[one.entry].is_random for sensors in placed.values() for one in sensors
-    )
+    drawn = any(scenario.sensors[s.entry].is_random for sensors in placed.values() for s in sensors)
     run, states = None, np.zeros((len(times), plant.n))
     if (simulated or drawn) and len(times):
         run = simulate(dataclasses.replace(scenario, probe=times), seed, replica, engine)
@@ -94,14 +92,10 @@ def collect_readings(
         for one in sensors:
             key = node, one.ordinal
             rows = np.searchsorted(times, times_of[key])
-            of_sensor = _readings_of(
-                scenario, streams, (node, one), numbers[key], rows, states - origin
-            )
+            own = _readings_of(scenario, streams, (node, one), numbers[key], rows, states - origin)
             at = scenario.time_grid.snap(times + _sensing_delay(scenario))
             pauses = [one for one in down if one.node == node]
-            readings += (
-                r for r in of_sensor if not any(p.begin <= at[r.number] < p.end for p in pauses)
-            )
+            readings += (r for r in own if not any(p.begin <= at[r.number] < p.end for p in pauses))
     readings.sort(key=lambda one: one.number)
     return RunReadings(times, readings, run, origin)
 

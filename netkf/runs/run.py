@@ -28,12 +28,7 @@ from netkf.runs.parquet_files import ParquetSink
 from netkf.runs.provenance import machine, versions
 from netkf.runs.quantities import NetworkSink
 from netkf.runs.simulate import choose_engine, require_scenario
-from netkf.runs.summary import (
-    PromisedTraces,
-    SummarySink,
-    promise_traces,
-    summarise,
-)
+from netkf.runs.summary import PromisedTraces, SummarySink, promise_traces, summarise
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.usage import record_usage
 from netkf.trace.recorder import Fingerprint, Recorder, Sink
@@ -115,14 +110,12 @@ def run_to_directory(
 
 
 def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
-    """Write a simulated run to a new or empty directory, as ``netkf run`` does, and return its
-    path.
+    """Write a simulated run to a new or empty directory, as ``netkf run`` does; return its path.
 
     The files are scenario.toml, manifest.json, the Parquet tables and summary.json. scenario.toml
     has the seed of the run, so that simulating it again gives the same files for replica 0.
 
-    Raises ScenarioError if the run belongs to another scenario or the directory is not empty, and
-    WriteError.
+    Raises ScenarioError for another scenario or a directory that is not empty, and WriteError.
     """
     require_scenario(scenario, "save", ", directory", "run, ")
     directory = as_path("directory", directory)
@@ -160,7 +153,6 @@ class _Output:
 
     @property
     def sinks(self) -> list[Sink]:
-        """All sinks, which receive the events and samples of the run."""
         tables = [] if self.tables is None else [self.tables]
         return [self.samples, self.fingerprint, *tables, *self.links, *self.network]
 
@@ -176,7 +168,6 @@ class _Output:
         sums: dict[str, tuple[float, float]],
         status: str,
     ) -> dict[str, Any]:
-        """Write summary.json, and return its contents; raises WriteError."""
         messages = {
             "sent": count("send"),
             "delivered": count("deliver"),

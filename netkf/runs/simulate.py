@@ -26,8 +26,7 @@ def choose_engine(
     name_or_engine: str | Engine, scenario: Scenario, announce: bool = True
 ) -> Engine:
     """Return the engine by name or itself: ``simpy`` (``processes``), ``compiled``, or ``auto``,
-    compiled if possible; with ``announce`` one that compiles first, or cannot, prints so. Raises
-    EngineError.
+    compiled if possible; with ``announce`` it says so if it compiles first. Raises EngineError.
     """
     if isinstance(name_or_engine, Engine):
         engine: Engine = name_or_engine

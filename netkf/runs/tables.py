@@ -97,7 +97,16 @@ def summary_table(
         )
     lines += _held_out_lines(summary.get("held_out", []))
     if "conserved" in summary:
-        lines.append("mass: " + _describe_conserved(summary["conserved"]))
+        sums = summary["conserved"]
+        totals = [
+            f"{name} {format_number(entry['total'])} of {format_number(entry['exact'])} "
+            f"({entry['drift']:+.1e})"
+            for name, entry in sums.items()
+        ]
+        worst = max(abs(entry["drift"]) for entry in sums.values())
+        drifting = ", drifting: directions of a link do not fail together"
+        more = drifting if worst > DRIFT_TOLERANCE else ""
+        lines.append(f"mass: {', '.join(totals)}{more}")
     lines += [*_quantity_lines(summary), _message_line(summary["messages"])]
     lines += [f"note: {note}" for note in usage_notes(summary.get("records", {}))]
     return "\n".join(lines)
@@ -194,17 +203,6 @@ def _message_line(messages: dict[str, Any]) -> str:
     if messages["in_flight"]:
         line += f", {format_count(messages['in_flight'])} on their way at the end"
     return line
-
-
-def _describe_conserved(sums: dict[str, dict[str, float]]) -> str:
-    totals = [
-        f"{name} {format_number(entry['total'])} of {format_number(entry['exact'])} "
-        f"({entry['drift']:+.1e})"
-        for name, entry in sums.items()
-    ]
-    worst = max(abs(entry["drift"]) for entry in sums.values())
-    drifting = ", drifting: directions of a link do not fail together"
-    return ", ".join(totals) + (drifting if worst > DRIFT_TOLERANCE else "")
 
 
 def format_count(value: float) -> str:

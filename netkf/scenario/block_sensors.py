@@ -144,8 +144,7 @@ def _of_blocks(sensor: Any, layout: Layout, topology: Topology) -> Iterator[Any]
         with errors_under("of"):
             whose = f"node {node}"
             if sensor.record is not None and node in sensor.record.nodes:
-                row = sensor.record.nodes.index(node)
-                whose += f" of {sensor.record.columns.where(row)}"
+                whose += f" of {sensor.record.columns.where(sensor.record.nodes.index(node))}"
             nodes.setdefault(layout.require(name, node, whose), []).append(node)
     for place, readers in nodes.items():
         yield _for_block(sensor, place, tuple(readers), layout)

@@ -185,9 +185,7 @@ class DerivedScenario(ScenarioModel):
             changed = dict(zip(names, matrices, strict=True))
             if self.model_views is not None and not pooled:
                 views = zip(first, self.model_views, strict=True)
-                parts = (
-                    (m, {n: M[view][:, view] for n, M in changed.items()}) for m, view in views
-                )
+                parts = ((m, {n: M[v][:, v] for n, M in changed.items()}) for m, v in views)
                 pieces.append(tuple(dataclasses.replace(model, **part) for model, part in parts))
                 continue
             # Equal models stay one object.
@@ -209,9 +207,7 @@ class DerivedScenario(ScenarioModel):
     def waking_nodes(self) -> frozenset[int]:
         """The nodes (ids) that are down at times and have sensors that give increments."""
         lives = self.network.lives
-        return frozenset(node for life in lives for node in life.nodes).intersection(
-            self.increment_sensors
-        )
+        return frozenset(i for one in lives for i in one.nodes).intersection(self.increment_sensors)
 
     @property
     def followed_slots(self) -> tuple[int, ...]:
@@ -449,7 +445,6 @@ class DerivedScenario(ScenarioModel):
 
     @property
     def _total_information(self) -> FloatArray:
-        """The sum (n, n) of ``informations``."""
         total = np.zeros((self.plant.n, self.plant.n))
         if self.views is None:
             for information in self.informations:
@@ -750,8 +745,7 @@ class DerivedScenario(ScenarioModel):
         self, node: int, believed: bool = False
     ) -> tuple[FloatArray, FloatArray]:
         """Return ``H`` (p, n) and ``R`` (p, p), of filters if ``believed``, of all sensors of a
-        node, of a diffusion those with increments. Raises TheoryError for a nonlinear or varying
-        one.
+        node, of a diffusion those with increments. Raises TheoryError if it is not constant.
         """
         sensors_of_nodes = self.placed_sensors if self.slotted else self.increment_sensors
         placed_sensors = sensors_of_nodes.get(node, ())
@@ -878,8 +872,7 @@ class DerivedScenario(ScenarioModel):
             times, values, sine = plant.tables_of_input
             if not isinstance(view, slice) and len(times):
                 # Predictions begin anew where inputs of its own blocks change.
-                changes = (np.diff(values[:, inputs], axis=0) != 0.0).any(axis=1)
-                jumps = np.append(True, changes)
+                jumps = np.append(True, (np.diff(values[:, inputs], axis=0) != 0.0).any(axis=1))
                 times, values = times[jumps], values[jumps]
             known = self._known_inputs[inputs]
             amplitudes = np.stack([known, np.ones_like(known), np.ones_like(known)])

@@ -204,8 +204,7 @@ class Metrics(Component):
 class PlacedSensor(NamedTuple):
     """One sensor on one node.
 
-    ``entry`` is its index in ``Scenario.sensors``, ``ordinal`` its number among the sensors of the
-    node.
+    ``entry`` is its index in ``Scenario.sensors``, ``ordinal`` its number at the node.
     """
 
     entry: int
@@ -231,8 +230,7 @@ class ScenarioModel(Component):
     """The fields of a scenario, and properties that need no numerical computation.
 
     With ``plants``, blocks of the state, ``plant`` is the stacked one, and ``sensors`` are those of
-    the stacked state; ``sensor_entries`` has the index of the one of ``declared_sensors`` that each
-    comes from.
+    the stacked state; ``sensor_entries`` are indices of the ``declared_sensors`` they come from.
 
     ``horizon`` and ``probe`` are in simulated seconds; ``probe`` is the period of the state
     samples, or an array (T,) of their increasing times.
@@ -713,9 +711,7 @@ class ScenarioModel(Component):
         )  # fmt: skip
 
     def messages_of_slot(self, link: Link) -> list[tuple[float, Transmission]]:
-        """Return the share of each exchange in the messages of a slot, and such a message, on a
-        link; under clocks one.
-        """
+        """Return each exchange's share of a slot's messages, and one of its messages, on a link."""
         first, radio, timing = self.transmission(link), self.network.radio, self.node_filter.timing
         if radio is None or not self.slotted:
             return [(1.0, first)]

@@ -165,7 +165,7 @@ KINDS["slot filter"] = {
 """The classes by family and name.
 
 The name is the kind. Where several classes share a kind, it is the kind and the value of another
-key that chooses the class (algorithms.registry.choice_name). "slot activation" is for plants in
+key that chooses the class (algorithms.registry). "slot activation" is for plants in
 slots; "slot filter" holds those of "filter" that run in slots.
 """
 

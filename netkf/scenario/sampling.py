@@ -68,12 +68,10 @@ def _checked_times(sensor: Sensor, given: Any) -> FloatArray:
     return times.astype(np.float64)
 
 
-def sample_path(
-    scenario: ScenarioModel, streams: Streams, node: int, placed_sensor: PlacedSensor
-) -> Samples:
+def sample_path(scenario: ScenarioModel, streams: Streams, node: int, one: PlacedSensor) -> Samples:
     """Return the samples of one sensor of a node in one run in continuous time."""
-    sensor: Sensor = scenario.located_sensors[placed_sensor.entry]
-    return sensor.samples(node, _make_generator(streams, node, placed_sensor), scenario.horizon)
+    sensor: Sensor = scenario.located_sensors[one.entry]
+    return sensor.samples(node, _make_generator(streams, node, one), scenario.horizon)
 
 
 def _iterate_sampled_sensors(scenario: ScenarioModel) -> Iterator[tuple[int, PlacedSensor]]:

@@ -186,9 +186,7 @@ def _build(cls: type[S], table: Mapping[str, Any], origin: Origin) -> Any:
     return _build_object(cls, _build_inner(values, builders), origin, ("format",))
 
 
-def _build_inner(
-    table: dict[str, Any], builders: Mapping[str, Callable[[Any], Any]]
-) -> dict[str, Any]:
+def _build_inner(table: dict[str, Any], builders: Mapping[str, Any]) -> dict[str, Any]:
     """Return a table with the objects that ``builders`` make of the values of its keys."""
     built = dict(table)
     for key, builder in builders.items():
@@ -274,11 +272,8 @@ def _construct(cls: type[Any], values: dict[str, Any]) -> Any:
 
 
 def _build_plant(origin: Origin, value: Any) -> Any:
-    builders = {
-        "f": partial(_find_dynamics, origin),
-        "input": partial(_build_part, "input", origin),
-    }
-    table = _build_inner(_as_dict(value), builders)
+    build = {"f": partial(_find_dynamics, origin), "input": partial(_build_part, "input", origin)}
+    table = _build_inner(_as_dict(value), build)
     if table.get("kind") in ("recorded", "unknown") and "f" in table:
         if table["kind"] == "unknown":
             table["unknown"] = True

@@ -129,8 +129,7 @@ class ComparedFilter:
 @dataclass(frozen=True)
 class FilterComparison(NotebookTable):
     """Filters side by side; all intervals of differences from the first that can run hold together
-    with probability ``confidence``. ``curves`` are the mean square errors over time of those that
-    ran.
+    with probability ``confidence``. ``curves`` are mean square errors of those that ran.
     """
 
     scenario: str
@@ -197,8 +196,7 @@ def compare_filters(
     right together with probability ``confidence``. ``runs``, ``seed`` and the other options are
     those of ``netkf.monte_carlo``, for each filter.
 
-    Raises ScenarioError if no filter can run, if there is no such kind, or for a table with a wrong
-    key or value.
+    Raises ScenarioError if no filter can run, and for an unknown kind, key or value.
     """
     require_scenario(scenario, "compare_filters", ", ...")
     confidence = number(above=0.0, below=1.0)("confidence", confidence)
@@ -226,15 +224,13 @@ def compare_filters(
     )
 
 
-def _simulate(
-    candidate: Scenario, pool: Pool, *, runs: int, seed: int, engine: str
-) -> FilterValues:
+def _simulate(scenario: Scenario, pool: Pool, *, runs: int, seed: int, engine: str) -> FilterValues:
     task = partial(
-        block_values, engine=choose_engine(engine, candidate), rows=curve_rows(candidate, runs)
+        block_values, engine=choose_engine(engine, scenario), rows=curve_rows(scenario, runs)
     )
-    with explain_failures(candidate):
+    with explain_failures(scenario):
         found: FilterValues = replicate_blocks(
-            task, join_batches, candidate, runs, seed, pool=pool, form=VALUES
+            task, join_batches, scenario, runs, seed, pool=pool, form=VALUES
         )
         return found
 

@@ -157,11 +157,9 @@ def _block_consistency(
 
 
 def _mean(values: FloatArray, blurred: np.ndarray) -> FloatArray:
-    count = (~blurred).sum(axis=0)
+    n = (~blurred).sum(axis=0)
     with np.errstate(invalid="ignore"):
-        return np.asarray(
-            np.where(blurred, 0.0, values).sum(axis=0) / np.where(count, count, np.nan)
-        )
+        return np.asarray(np.where(blurred, 0.0, values).sum(axis=0) / np.where(n, n, np.nan))
 
 
 def _mean_known(values: Sequence[float]) -> float:
@@ -307,8 +305,7 @@ class NodeConsistency:
 
 @dataclass(frozen=True)
 class Consistency(NotebookTable):
-    """Rows by node, and by block where the state has several; false if errors contradict their
-    expected size.
+    """Rows by node, and by block where there are several; false if errors contradict P.
 
     ``low`` and ``high`` are the two-sided chi-square bounds at ``confidence`` on the mean NEES of a
     sample over the runs if P is exact, of the largest number of states ``n``; divided by n they

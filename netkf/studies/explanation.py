@@ -30,8 +30,7 @@ times that of the run with every message delivered.
 
 class Missing(NamedTuple):
     """A message, number ``message`` from ``sender`` to ``receiver`` (ids), that was sent but not
-    used: its ``outcome`` (of OUTCOMES), and when it was ``sent`` and ``arrived`` (seconds, nan if
-    it did not).
+    used: its ``outcome`` (of OUTCOMES), and when it was ``sent`` and ``arrived`` (s, or nan).
     """
 
     sender: int
@@ -248,21 +247,19 @@ class Why:
 
     def _reading_sentences(self) -> Iterator[str]:
         sensors = [s for s in self.sources if s.sensor and s.node != self.node]
-        with_reading = sorted(
-            (s for s in sensors if not math.isnan(s.reading)), key=lambda s: s.reading
-        )
+        known = sorted((s for s in sensors if not math.isnan(s.reading)), key=lambda s: s.reading)
         without_reading = [s for s in sensors if math.isnan(s.reading)]
-        if with_reading:
+        if known:
             parts = [
                 f"{self.at - s.reading:.4g} s old from node {s.node} ({_format_route(s)})"
-                for s in with_reading[:MAX_LISTED]
+                for s in known[:MAX_LISTED]
             ]
-            prefix = "The oldest of its" if len(with_reading) > MAX_LISTED else "Its"
+            prefix = "The oldest of its" if len(known) > MAX_LISTED else "Its"
             yield f"{prefix} newest readings are {_join_with_and(parts)}."
         if without_reading:
             nodes = _list_items([s.node for s in without_reading])
             yield f"No reading of node {nodes} can have reached it."
-        yield from self._missed_reading_sentences(with_reading + without_reading)
+        yield from self._missed_reading_sentences(known + without_reading)
 
     def _missed_reading_sentences(self, sensors: list[InformationSource]) -> Iterator[str]:
         kept_from_newer = [s for s in sensors if s.missing]

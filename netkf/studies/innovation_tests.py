@@ -161,7 +161,6 @@ class InnovationTests(NotebookTable):
     rows: tuple[NodeInnovations, ...]
 
     def __repr__(self) -> str:
-        """Return one line: how many nodes are broken."""
         broken = sum(row.verdict.startswith("BROKEN") for row in self.rows)
         return (
             f"<netkf innovations of {self.scenario!r}: {broken} of {len(self.rows)} nodes BROKEN>"

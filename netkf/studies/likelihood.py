@@ -327,10 +327,7 @@ class NoiseFit(NotebookTable):
         return self.given.replace(self.changes)
 
     def __repr__(self) -> str:
-        """Return one line: the variances and the gain of log-likelihood."""
-        values = ", ".join(
-            f"{row.name} = {row.value:.4g}" for row in self.table.itertuples(index=False)
-        )
+        values = ", ".join(f"{v.name} = {v.value:.4g}" for v in self.table.itertuples(index=False))
         gain = self.log_likelihood - self.start_log_likelihood
         return f"<netkf noise of {self.name!r}: {values}; log-likelihood +{gain:.4g}>"
 

@@ -130,9 +130,7 @@ class MeanEstimate(NamedTuple):
 
 
 def is_one_truth(x: FloatArray, other: FloatArray) -> bool:
-    """Return True if true states (K, n) are equal up to rounding, which an input that filters do
-    not know moves.
-    """
+    """Return True if true states (K, n) are equal up to rounding, which inputs may move."""
     scale = np.fmax.reduce(np.abs(x), axis=1, keepdims=True, initial=0.0)
     with np.errstate(invalid="ignore"):  # of infinite states, which are equal
         close = (x == other) | (np.abs(x - other) <= SAME * scale) | (np.isnan(x) & np.isnan(other))

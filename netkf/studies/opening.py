@@ -115,9 +115,7 @@ def _read_curves(path: Path, runs: int, base: Scenario) -> tuple[ErrorCurve, ...
 
 
 def _read_filter(row: dict[str, Any], names: tuple[str, ...]) -> ComparedFilter:
-    quantities = {
-        key: Quantity(row[key], *(row[f"{key}_{part}"] for part in PARTS)) for key in names
-    }
+    quantities = {k: Quantity(row[k], *(row[f"{k}_{part}"] for part in PARTS)) for k in names}
     ran = math.isfinite(row["transmissions"])
     return ComparedFilter(
         filter=row["filter"],
@@ -181,14 +179,6 @@ class StoredVerdict(NotebookTable):
         )
 
 
-def read_verdict(directory: Path, trust: bool = False) -> StoredVerdict:
-    """Return the verdict in a directory; raises DamagedError or ScenarioError."""
-    document = read_checked_document(directory, "verdict.json", VERDICT)
-    _require_confidence(document)
-    check_files(directory, document, ["scenario.toml"])
-    return StoredVerdict(directory, load(directory / "scenario.toml", trust=trust), document)
-
-
 MEANS = ("worst_rms", "mean_rms", "mean_trace", "worst_trace")
 RESULTS = (*MEANS, *(f"{name}_se" for name in MEANS), "bound", "central")
 """Columns of numbers that every sweep has beside its keys: means with standard errors, bounds."""
@@ -241,7 +231,10 @@ def open(directory: str | Path, *, trust: bool = False) -> Stored:
     name = shorten(directory)
     try:
         if not (folder / "manifest.json").exists() and (folder / "verdict.json").exists():
-            return read_verdict(folder, trust)
+            document = read_checked_document(folder, "verdict.json", VERDICT)
+            _require_confidence(document)
+            check_files(folder, document, ["scenario.toml"])
+            return StoredVerdict(folder, load(folder / "scenario.toml", trust=trust), document)
         if not folder.is_dir():
             raise DamagedError("it is no directory" if folder.exists() else "it does not exist")
         manifest = read_checked_document(folder, "manifest.json", MANIFEST_FORM)

@@ -16,11 +16,7 @@ from netkf.studies.compare_filters import ComparedFilter, FilterComparison
 from netkf.studies.sweep import CompletedSweep
 
 MAX_LABEL = 34
-PANELS = (
-    ("rms_error", "RMS error"),
-    ("worst_instant", "worst instant"),
-    ("nees_ratio", "NEES / n"),
-)
+PANELS = ("rms_error", "RMS error"), ("worst_instant", "worst instant"), ("nees_ratio", "NEES / n")
 
 
 def sweep_picture(scenario: Scenario, completed: CompletedSweep) -> bool:

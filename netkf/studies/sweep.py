@@ -256,7 +256,6 @@ def sweep_to_directory(
 
 
 def _write_table(directory: Path, table: pd.DataFrame) -> None:
-    """Write sweep.parquet and sweep.csv."""
     write_table(directory / "sweep.parquet", {str(name): table[name] for name in table})
     write_text(directory / "sweep.csv", table.to_csv(index=False))
 

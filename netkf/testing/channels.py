@@ -277,9 +277,7 @@ def _check_channel_state(watched: WatchedPart) -> None:
 
 def _check_fractions(watched: WatchedPart, links: dict[Link, float], seed: int) -> None:
     part = watched.part
-    sent = [
-        Transmission(link, table_probability=p, distance=DISTANCES[0]) for link, p in links.items()
-    ]
+    sent = [Transmission(w, table_probability=p, distance=DISTANCES[0]) for w, p in links.items()]
     stated = np.array([part.mean_delivery(one) for one in sent])
     if np.isnan(stated).all() and not part.independent:
         return

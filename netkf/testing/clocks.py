@@ -245,9 +245,7 @@ def _check_generators_used(
     watched: WatchedPart, entities: tuple[Entity, ...], times: list[list[FloatArray]]
 ) -> None:
     first, *others = times[0]
-    others_of = {
-        f"{list(entity)}": ticks for entity, ticks in zip(entities[1:], others, strict=True)
-    }
+    others_of = {f"{list(e)}": ticks for e, ticks in zip(entities[1:], others, strict=True)}
     for name, ticks in {"another run": times[1][0], **others_of}.items():
         count = min(len(first), len(ticks), GAPS)
         # Of other rates, in units of their first gaps.
@@ -328,8 +326,7 @@ def check_matching(matching: Any, /, topology: Topology | None = None, **setting
     if ``mean`` raises ScenarioError, a frequency that differs as much from those of the other links
     of a cycle, star or complete graph; a correlation of 0.07 of any two links 1, 2 or 3 slots
     apart. A ``mean`` that differs between equivalent links is accepted. Of recorded matchings only
-    the form is checked, and broadcasts draw nothing. A correct class fails once in a million
-    checks.
+    the form is checked, and broadcasts draw nothing. A correct class fails once in a million.
 
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
@@ -385,8 +382,7 @@ def _check_network(watched: WatchedPart, copy: Any, topology: Topology, seed: in
         for slot in np.flatnonzero((repeated != is_paired[:REPEATED_SLOTS]).any(axis=1))[:1]:
             rule, got = "must draw the same from equal generators", f"other pairs in slot {slot}"
             fail(where, rule, f"{got} {text}", "use only the generator given")
-    mean = _stated_mean(watched, topology)
-    _check_frequencies(watched, topology, is_paired, mean)
+    _check_frequencies(watched, topology, is_paired, _stated_mean(watched, topology))
     if is_paired.any(axis=0).any() and (is_paired[0] != is_paired).any():
         others = _draw_matchings(part, topology, where, _make_generator(seed, 1), SLOTS // 10)
         is_same, got = np.array_equal(others, is_paired[: len(others)]), "equal pairs from two"

@@ -236,8 +236,7 @@ class EstimateDifference(NamedTuple):
 
 
 def check_parent(watched: WatchedPart, same_as_parent: bool | None) -> None:
-    """Compare a filter that overrides something with its built-in parent, in slots and under
-    clocks.
+    """Compare a filter that overrides something with its parent, in slots and under clocks.
 
     Raises AssertionError if estimates differ by more than PARENT_TOLERANCE; with ``same_as_parent``
     None, a class that defines one of the methods STEPS gets a UserWarning instead.
@@ -268,8 +267,7 @@ def check_parent(watched: WatchedPart, same_as_parent: bool | None) -> None:
 
 
 def _with_weights(watched: WatchedPart, weights: FloatArray) -> WatchedPart:
-    changed = dataclasses.replace(watched.part, weights=weights)
-    return WatchedPart(changed).unchecked()
+    return WatchedPart(dataclasses.replace(watched.part, weights=weights)).unchecked()
 
 
 def _forbid_transposed(name: str, child: WatchedPart, parent: WatchedPart) -> None:

@@ -1,8 +1,7 @@
 """Tests of draws (:mod:`netkf.laws`) at the level of a checker, and of noise against its law.
 
 A checker makes at most ``FAMILIES`` families of tests. Each family gets the same share of the
-significance level ``LEVEL``, divided among its tests, so that a correct class fails once in a
-million checks.
+significance level ``LEVEL``, divided among its tests: a correct class fails once in a million.
 """
 
 from __future__ import annotations
@@ -99,14 +98,12 @@ def check_uncorrelated(one: FloatArray, other: FloatArray, labels: NoiseLabels, 
     demand_agreement(compare_with(one, other, *names, family_level()), labels.where, rule)
 
 
-def check_independent(
-    e: FloatArray, covariates: FloatArray, labels: NoiseLabels, name: str
-) -> None:
+def check_independent(e: FloatArray, others: FloatArray, labels: NoiseLabels, name: str) -> None:
     """Check that mean and variance of unit noise e (N, q) are the same above and below the medians
-    of ``covariates`` (N, r), values before the noise is drawn, which messages call ``name``.
+    of ``others`` (N, r), values before the noise is drawn, which messages call ``name``.
     """
     rule = f"{labels.noise} must not depend on {name}"
-    for comparison in compare_sides(e, covariates, family_level()) if len(e) >= MIN_VALUES else ():
+    for comparison in compare_sides(e, others, family_level()) if len(e) >= MIN_VALUES else ():
         demand_agreement(comparison, labels.where, rule)
 
 

@@ -215,8 +215,7 @@ class Observed(Filter):
     def shift(self, state: Any, offset: FloatArray) -> Any:
         """Return a state, or a payload under way, with another origin."""
         name = state._fields[0]
-        shifted = self.watched.part.shift(getattr(state, name), offset)
-        return state._replace(**{name: shifted})
+        return state._replace(**{name: self.watched.part.shift(getattr(state, name), offset)})
 
     def _offset(self, own: ObservedState) -> FloatArray | float:
         is_shifted = self.shift_of_truth is not None and own.shifted
@@ -255,9 +254,7 @@ class Observed(Filter):
         log.waiting = set(log.states) if self.period else set()
 
     def _sums(self) -> dict[str, float]:
-        by_node = [
-            self.watched.call("analysis.conserved", state) for state in self.log.states.values()
-        ]
+        by_node = [self.watched.call("analysis.conserved", s) for s in self.log.states.values()]
         names = by_node[0].keys() if isinstance(by_node[0], dict) else None
         same_names = all(isinstance(terms, dict) and terms.keys() == names for terms in by_node)
         rule = "must name the same quantities at every node"

@@ -157,8 +157,7 @@ def check_plant(plant: Any, /, **settings: Any) -> None:
 
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
-    part = make_part(plant, (Plant,), settings)
-    _check_plant(part, 0)
+    _check_plant(make_part(plant, (Plant,), settings), 0)
 
 
 def _check_plant(part: Any, seed: int) -> None:
@@ -295,9 +294,7 @@ def _check_noise(
     labels: NoiseLabels,
     rule: str,
 ) -> None:
-    """Check that ``after`` less ``moved`` (R, K, q), both of ``states``, is noise of covariance
-    ``S``.
-    """
+    """Check that ``after`` less ``moved`` (R, K, q), of ``states``, has noise covariance ``S``."""
     e = whitened(after - moved, S, component_sizes(after, moved), labels.where, rule)
     if not e.size:
         return
@@ -335,8 +332,7 @@ def _check_paths(
     for k, (Phi, S, noise) in enumerate(laws):
         after = states[:, k + 1 :: len(laws)]
         before = states[:, k : -1 : len(laws)][:, : after.shape[1]]
-        labels = NoiseLabels(where, noise, field)
-        _check_noise(after, before @ Phi.T, S, before, labels, rule)
+        _check_noise(after, before @ Phi.T, S, before, NoiseLabels(where, noise, field), rule)
 
 
 def _check_slots(part: LinearPlant, copy: LinearPlant, name: str, seed: int) -> None:

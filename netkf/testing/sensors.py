@@ -82,13 +82,11 @@ def check_sensor(sensor: Any, /, **settings: Any) -> None:
     one of N nodes must be sqrt(N) times as large, in one quarter of a run twice as large. Of the H
     of a RegressorSensor: a mean off by 0.18 standard deviations, a variance by 24 %. Sample times
     must increase, lie inside the run, not depend on its length, and be as many as the clock states
-    (off by 8 %). Recorded sensors are checked for pickle only. A correct class fails once in a
-    million checks.
+    (off by 8 %). Recorded sensors are only pickled. A correct class fails once in a million.
 
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
-    part = make_part(sensor, (Sensor,), settings)
-    _check_sensor(part, 0)
+    _check_sensor(make_part(sensor, (Sensor,), settings), 0)
 
 
 class ReadingSeries(NamedTuple):
@@ -176,17 +174,6 @@ def combine(pieces: Pieces) -> FloatArray:
     return total
 
 
-def demand_matrices(sensor: Any, name: str) -> None:
-    """Raise AssertionError unless H (p, n) and R (p, p) of a sensor have these shapes."""
-    for field in ("H", "R"):
-        matrix = getattr(sensor, field, None)
-        is_matrix = isinstance(matrix, np.ndarray) and matrix.ndim == 2
-        demand(is_matrix, f"{name}.{field}", "must be a matrix: filters are told it")
-    H, R = sensor.H, sensor.R
-    rule = f"must have the shape {(len(H), len(H))}, one row for each of H"
-    demand(R.shape == (len(H), len(H)), f"{name}.R", rule, str(R.shape))
-
-
 def _check_sensor(part: Any, seed: int) -> None:
     watched = WatchedPart(part)
     copy, name = watched.pickle_copy(), watched.name
@@ -195,7 +182,13 @@ def _check_sensor(part: Any, seed: int) -> None:
         return
     if not part.is_random:
         return
-    demand_matrices(part, name)
+    for field in ("H", "R"):
+        matrix = getattr(part, field, None)
+        is_matrix = isinstance(matrix, np.ndarray) and matrix.ndim == 2
+        demand(is_matrix, f"{name}.{field}", "must be a matrix: filters are told it")
+    H, R = part.H, part.R
+    rule = f"must have the shape {(len(H), len(H))}, one row for each of H"
+    demand(R.shape == (len(H), len(H)), f"{name}.R", rule, str(R.shape))
     nodes, sampling = part.nodes[:MAX_NODES], getattr(part, "sampling", None)
     with watched.guard():
         reader = make_reader(part, name)
@@ -275,8 +268,7 @@ def _check_laws(reader: SensorReader, nodes: tuple[int, ...], seed: int) -> None
     x = _make_states(seed, LENGTH, reader.n)
     for a, node in enumerate(nodes):
         for run in range(runs):
-            path = reader.make_path(Streams(seed, run), node)
-            series = reader.read_several(path, numbers, x)
+            series = reader.read_several(reader.make_path(Streams(seed, run), node), numbers, x)
             residual = series.y - np.einsum("kpn,kn->kp", series.H, x)
             noise[a, run], H[a, run] = residual @ factor.T, series.H
     check_white(noise.reshape(-1, LENGTH, reader.p), labels)
@@ -333,8 +325,7 @@ def _check_regressors(
         deviation, S = H[:, :, k] - sensor.C @ mean, sensor.C @ cov @ sensor.C.T
         unit = whitened(deviation, S, component_sizes(H[:, :, k]), reader.where, rule)
         v = noise[:, :, k].reshape(-1, 1) / np.sqrt(sensor.R[0, 0])
-        flat_H = H[:, :, k].reshape(len(v), -1)
-        check_independent(v, flat_H, noise_labels, f"H, in slot {k}")
+        check_independent(v, H[:, :, k].reshape(len(v), -1), noise_labels, f"H, in slot {k}")
         if unit.size:
             check_white(unit.reshape(-1, 1, unit.shape[-1]), H_labels)
         if unit.size and len(pair) > 1:
@@ -349,8 +340,7 @@ def _check_regressor_steps(sensor: RegressorSensor, H: FloatArray, labels: Noise
         return
     s = H @ np.linalg.pinv(sensor.C).T
     steps = s[:, 1:] - s[:, :-1] @ sensor.A.T
-    drive_cov = sensor.B @ sensor.xi_cov @ sensor.B.T
-    unit = steps @ whiten(drive_cov).factor.T
+    unit = steps @ whiten(sensor.B @ sensor.xi_cov @ sensor.B.T).factor.T
     check_white(unit, labels._replace(noise="the steps of H"))
 
 

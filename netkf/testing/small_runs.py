@@ -182,9 +182,7 @@ def tick_of(kind: Kind) -> float:
 def small_scenario(
     algorithm: Filter, system: System, kind: Kind, channel: Channel, lives: tuple[Life, ...] = ()
 ) -> Scenario:
-    """Return a scenario of a filter on a complete network of 2 or 3 nodes, node 1 without a
-    sensor.
-    """
+    """Return a scenario of a filter on 2 or 3 nodes, all linked, node 1 without a sensor."""
     weights, tick = algorithm.link_weights, tick_of(kind)
     count = 3 if weights.largest_degree >= 2.0 else 2
     count = count if weights.matrix is None else len(weights.matrix)

@@ -1,6 +1,4 @@
-"""Calls of methods of users' classes that check for side effects, and random generators that record
-their calls.
-"""
+"""Calls of users' methods that check for side effects, and generators that record their calls."""
 
 from __future__ import annotations
 
@@ -349,7 +347,6 @@ class _UncheckedPart(WatchedPart):
     """A component whose methods are called once and not checked for side effects."""
 
     def call(self, method: str, *arguments: Any, repeatable: bool = True) -> Any:
-        """Call a method once and return the result."""
         return self._call_method(f"{self.name}.{method}", method, arguments)
 
 

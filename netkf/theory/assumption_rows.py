@@ -96,8 +96,7 @@ def _clock_rows(scenario: Scenario) -> list[AssumptionRow]:
     rows = [*_plant_rows(scenario), *_sampling_rows(scenario)]
     if scenario.filter.algorithm.timing.talks:
         network = [*_link_clock_rows(scenario), *_channel_rows(scenario)]
-        graph = connected_row(scenario, "H II-B a")
-        rows = [graph, *_weight_rows(scenario), *rows, *network]
+        rows = [connected_row(scenario, "H II-B a"), *_weight_rows(scenario), *rows, *network]
     return [*rows, *start_rows(scenario, "H (9), (10)")]
 
 

@@ -42,8 +42,7 @@ class ErrorLaw(NamedTuple):
     """The Gaussian law of the errors of M estimators at T times given the events of a run.
 
     ``mean`` (T M n,) and ``covariance`` (T M n, T M n) of all errors together, ``P`` (T, M, n, n),
-    where nodes that estimate blocks have n states, of which those beyond their own are 0, with the
-    variance 1 in P.
+    where nodes that estimate blocks have n states, others than their own being 0 and 1 in P.
     """
 
     mean: FloatArray

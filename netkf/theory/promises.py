@@ -56,8 +56,7 @@ LIMITS: dict[str, Callable[[Scenario], FloatArray]] = {
 
 def compute_promises(scenario: Scenario) -> dict[str, Any]:
     """Return what theory states as plain JSON: assumptions, bounds, rates, limits, results of the
-    paper and exact errors, None with a ``reason``; of the last piece but for the bound at the
-    horizon.
+    paper and exact errors, None with a ``reason``; of the last piece but for the bound at the end.
     """
     if have_one_view(scenario):
         scenario = scenario_of_estimates(scenario)
@@ -159,8 +158,7 @@ def _steady_bound(scenario: Scenario) -> dict[str, Any]:
         return {"value": None, "trace": None, "reason": reason}
     result = _value_or_reason(lambda: steady_covariance_bound(scenario))
     if result["reason"] and not scenario.filter.algorithm.timing.talks:
-        by_node = _value_or_reason(lambda: steady_by_node(scenario))
-        return {**by_node, "reason": result["reason"]}
+        return {**_value_or_reason(lambda: steady_by_node(scenario)), "reason": result["reason"]}
     return result
 
 

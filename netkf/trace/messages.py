@@ -39,8 +39,7 @@ def join_messages(log: np.ndarray) -> np.ndarray:
     """Return one MESSAGE row for each of the M messages sent in a run, (M,), ordered by sender,
     receiver and number: its send event joined with that of its delivery or loss.
 
-    ``log`` (E,) are the EVENT rows of the run. Raises ValueError if an outcome belongs to no send
-    event.
+    ``log`` (E,): the EVENT rows of the run. Raises ValueError for an outcome without a send.
     """
     kind, send = log["kind"], CODES["send"]
     sends, ends = np.flatnonzero(kind == send), np.flatnonzero(np.isin(kind, [*OUTCOMES]))
@@ -84,8 +83,6 @@ def _keys(*pairs: tuple[np.ndarray, np.ndarray]) -> tuple[IntArray, IntArray]:
 
 
 def by_link(messages: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield the MESSAGE rows of each directed link; ``messages`` (M,) are in the order of
-    ``join_messages``.
-    """
+    """Yield MESSAGE rows (M,), in the order of ``join_messages``, of each directed link."""
     ends = np.flatnonzero((np.diff(messages["sender"]) != 0) | (np.diff(messages["receiver"]) != 0))
     yield from np.split(messages, ends + 1) if len(messages) else ()

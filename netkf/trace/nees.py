@@ -44,9 +44,7 @@ def without_padding(e: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArra
 
 
 def traces(P: FloatArray) -> FloatArray:
-    """Return the traces (...) of covariances P (..., n, n) over the states that a node estimates,
-    nan where all of P is.
-    """
+    """Return traces (...) of P (..., n, n) over estimated states, nan where all of P is."""
     variances = np.diagonal(P, axis1=-2, axis2=-1)
     missing = np.isnan(variances)
     if not missing.any():
@@ -82,8 +80,7 @@ def fill_nees(
     solved: FloatArray,
 ) -> None:
     """Write NEES into ``out`` (R, K), nan where P is exactly singular; set ``regular`` (R,) to
-    False for runs with a finite P that is exactly singular. ``factor`` (n, n) and ``solved`` (n, 1)
-    are scratch.
+    False for runs with an exactly singular P. ``factor`` (n, n), ``solved`` (n, 1): scratch.
     """
     n = len(size)
     for r in range(len(e)):
@@ -110,13 +107,7 @@ def fill_nees(
 
 @kernel
 def fill_indefinite(
-    e: FloatArray,
-    P: FloatArray,
-    r: int,
-    k: int,
-    out: FloatArray,
-    factor: FloatArray,
-    solved: FloatArray,
+    e: FloatArray, P: FloatArray, r: int, k: int, out: FloatArray, L: FloatArray, solved: FloatArray
 ) -> bool:
     """Write NEES of sample ``k`` of run ``r``, whose P is not positive definite, by elimination
     with pivoting; return False if P is finite and exactly singular.
@@ -126,9 +117,9 @@ def fill_indefinite(
         solved[i, 0] = e[r, k, i]
         finite = finite and np.isfinite(e[r, k, i])
         for j in range(n):
-            factor[i, j] = P[r, k, i, j]
+            L[i, j] = P[r, k, i, j]
             finite = finite and np.isfinite(P[r, k, i, j])
-    solve_inplace(factor, solved, n)  # solved = P^-1 e
+    solve_inplace(L, solved, n)  # solved = P^-1 e
     out[r, k] = 0.0
     for i in range(n):
         out[r, k] += e[r, k, i] * solved[i, 0]
@@ -149,8 +140,7 @@ def blurred_from(
 
     The rounding error is that of states x (R, T, n), with ``exact`` errors that of the errors e
     (R, T, N, n), which a node may have passed on to others. The standard deviation is the smallest
-    of P (R, T, N, n, n) or, where P is nan, the root mean square of e. Run r has ``lengths[r]``
-    samples.
+    of P (R, T, N, n, n) or, if nan, the root mean square of e. Run r has ``lengths[r]`` samples.
     """
     first = np.full(len(x), np.inf)
     e, P = without_padding(e, P)
@@ -193,9 +183,7 @@ def find_blurred(
 
 @kernel
 def variance_of_errors(P: FloatArray, e: FloatArray, r: int, t: int) -> float:
-    """Return the mean square of the errors of sample ``t`` of run ``r`` if all of P is nan, else
-    nan.
-    """
+    """Return the mean square error of sample ``t`` of run ``r`` if all of P is nan, else nan."""
     filters, n = e.shape[2:]
     total = 0.0
     for f in range(filters):

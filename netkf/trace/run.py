@@ -62,9 +62,7 @@ class Run(NotebookTable):
     scenario: Any = None
 
     def __repr__(self) -> str:
-        """Return one line: status, number and span of samples, nodes, states, events, seed and
-        replica.
-        """
+        """Return one line: status, samples, nodes, states, events, seed and replica."""
         span = f"{self.times[0]:g} .. {self.times[-1]:g} s" if len(self.times) else "nothing"
         return (
             f"<netkf.Run: {self.status}, {len(self.times)} samples of {span}, {len(self.nodes)} "
@@ -105,9 +103,7 @@ class Run(NotebookTable):
 
     @cached_property
     def rounding(self) -> FloatArray:
-        """The magnitude (T,) of the rounding error of ``error``: that of the numbers that the run
-        computes with.
-        """
+        """The magnitude (T,) of the rounding error of ``error``, by the numbers computed with."""
         sizes = np.abs(self.error).max(axis=1) if self.exact_errors else np.abs(self.x)
         return np.asarray(ROUNDING * sizes.max(axis=1))
 
@@ -214,9 +210,7 @@ class BlockSamples(NamedTuple):
 
 
 def plot_by_name(result: Any, figure: str) -> Any:
-    """Return a figure of a result, drawn by netkf.figures; raises ScenarioError for another name
-    and without matplotlib.
-    """
+    """Return a result's figure; raises ScenarioError for another name or without matplotlib."""
     require("matplotlib", "plot", "plot")
     return WINGS.draw(result, text("figure", figure))
 
@@ -243,8 +237,7 @@ def event_columns(
 
 def blurred_samples(run: Run, matrices: FloatArray) -> np.ndarray:
     """Return a mask (T, N) of the samples that tests of consistency leave out, since rounding blurs
-    them: the rounding error exceeds 1 / BLUR of the standard deviation of the error in some
-    direction.
+    them: the rounding error exceeds 1 / BLUR of the standard deviation in some direction.
 
     ``matrices`` (T, N, n, n) are the covariances of the errors. Directions without uncertainty
     (variances below the share CERTAIN of the largest one) and matrices of nan do not count.

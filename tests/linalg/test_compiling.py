@@ -52,7 +52,7 @@ def test_python_and_kernels_call_a_kernel_alike():
 def test_a_kernel_is_compiled_once_for_all_constants(monkeypatch, tmp_path):
     # What is loaded from the disk has no signatures here.
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
-    kernel(sum_of_powers._loops)(np.ones(2))
+    kernel(sum_of_powers.loops)(np.ones(2))
     signatures = power._kernel_dispatcher.signatures
     # One without ``scale`` and one with it: the constants 2 and 3 are no types.
     assert len(signatures) == 2

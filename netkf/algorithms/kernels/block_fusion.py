@@ -75,9 +75,7 @@ def fusion_of(n: int, p: int) -> Fusion:
 
 @kernel
 def multiply_in_place(A: FloatArray, k: int, T: FloatArray, column: FloatArray, q: int) -> None:
-    """Multiply the matrix ``A[k]`` by ``T`` (n, n) from the left in lane ``q``; ``column`` (n,) is
-    scratch.
-    """
+    """Multiply ``A[k]`` by ``T`` (n, n) from the left in lane ``q``; ``column`` (n,) is scratch."""
     n = len(T)
     for j in range(n):
         for i in range(n):

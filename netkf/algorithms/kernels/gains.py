@@ -2,8 +2,7 @@
 
 A sensor ``dy = H x dt + dv`` with noise of covariance R per second gives a filter of an interval
 only its moments ``int P_j dy`` with the Legendre polynomials P_0 and P_1 (``linalg.legendre``). The
-filter predicts estimate and covariance P to b (``riccati`` or ``root_flow``), then corrects the
-estimate.
+filter predicts estimate and P to b (``riccati`` or ``root_flow``), then corrects the estimate.
 
 Exactly, ``xhat(b) = exp(A g) xhat(a) + int k(s) (dy - H xhat_open(s) ds)`` with the weight ``k(s) =
 Phi(b, s) P(s) H' R^-1`` and the open-loop prediction ``xhat_open``. Since the Hamiltonian flow is

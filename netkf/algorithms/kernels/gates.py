@@ -60,8 +60,7 @@ def gate_tables(
     own: IntArray,
 ) -> GateTables:
     """Return the tables of a gate for estimates of n states, ``own`` (H,) of them of the own blocks
-    of each node: ``runs`` = (L, active), and for each list of parts the (row, length) of each of
-    its ``parts``.
+    of each node: ``runs`` = (L, active), and for each list of parts the (row, length) of each.
     """
     every = np.array([part for some in parts for part in some], dtype=np.int64).reshape(-1, 2)
     most = int(every[:, 1].max(initial=0))
@@ -82,9 +81,7 @@ def gate_tables(
 
 
 def own_sizes(infos: Sequence[Any], n: int, pooled: bool) -> IntArray:
-    """Return how many of its n states each node has of its own blocks: all without any, and of a
-    ``pooled`` filter.
-    """
+    """Return how many states each node has of its own blocks: n without any, or ``pooled``."""
     return np.array([n if pooled else info.own_states(n) for info in infos], dtype=np.int64)
 
 

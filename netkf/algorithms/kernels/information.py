@@ -1,5 +1,4 @@
-"""Kernels of consensus on information (CI, HCMCI, ICF): weighted sums of information pairs, carried
-as roots.
+"""Kernels of consensus on information (CI, HCMCI, ICF): sums of information pairs, as roots.
 
 An information pair (Omega, q), with Omega = P^-1 and q = P^-1 x for an estimate x, is stored as a
 root (Z, z), n by n + 1, with ``Omega = Z' Z`` and ``q = Omega c + Z' z``. Z is lower triangular,

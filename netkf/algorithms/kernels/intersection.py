@@ -24,10 +24,8 @@ TINY = 1e-200  # what NEGLIGIBLE is for a pivot of 0, yet above underflow
 
 
 @kernel(inlined=True, fused=True)
-def invert_lanes(
-    lanes: Lanes, size: Size, out: FloatArray, k: int, root: FloatArray, m: int
-) -> None:
-    """Write the inverse of the lower triangular ``root[m]`` (n, n, L) into ``out[k]``.
+def invert_lanes(lanes: Lanes, size: Size, out: FloatArray, k: int, S: FloatArray, m: int) -> None:
+    """Write the inverse of the lower triangular ``S[m]`` (n, n, L) into ``out[k]``.
 
     Pivots are raised to SINGULAR (2^-25) times the length of their row: soon after a start from
     P = 0 some are rounding. That makes P no smaller.
@@ -36,21 +34,21 @@ def invert_lanes(
     n, smallest = len(size), spread(lanes, TINY)
     for i in range(n):
         for j in range(i + 1):
-            entry = load(lanes, root, m, i, j)
+            entry = load(lanes, S, m, i, j)
             smallest += NEGLIGIBLE * entry * entry
     for i in range(n):
         row = smallest
         for j in range(i + 1):
-            entry = load(lanes, root, m, i, j)
+            entry = load(lanes, S, m, i, j)
             row += entry * entry
-        diagonal, floor = load(lanes, root, m, i, i), SINGULAR * root_of(row)
+        diagonal, floor = load(lanes, S, m, i, i), SINGULAR * root_of(row)
         length = magnitude(diagonal)
         inverse = 1.0 / with_sign(select(length > floor, length, floor), diagonal)
         # Forward substitution, row i of S^-1.
         for j in range(i):
             value = spread(lanes, 0.0)
             for q in range(j, i):
-                value -= load(lanes, root, m, i, q) * load(lanes, out, k, q, j)
+                value -= load(lanes, S, m, i, q) * load(lanes, out, k, q, j)
             store(lanes, out, k, i, j, value * inverse)
         store(lanes, out, k, i, i, inverse)
 
@@ -134,8 +132,7 @@ def finish_lanes(
     ``centre[h]`` (n, L): Z^-1 into ``root[h]`` (n, n, L) and ``centre + Z^-1 z`` into ``xhat[h]``
     (n, L), which may be the centre itself.
 
-    Lanes with the flag ``unchanged`` (L,) keep their estimate; ``whitened`` (n, n + 1, L) is
-    scratch.
+    Lanes with the flag ``unchanged`` (L,) stay; ``whitened`` (n, n + 1, L) is scratch.
     """
     # S = Z^-1: the total is lower triangular, so P = Z^-1 Z^-T has the lower root Z^-1.
     n = len(size)

@@ -20,8 +20,7 @@ def received_weight(run: Any) -> Any:
     """Return the sum (L,) of the weights of all messages in the inbox that have arrived."""
     total = spread(run.lanes, 0.0)
     for k in range(run.count):
-        arrived = load_flags(run.lanes, run.arrived, k)
-        total += select(arrived, run.message_weight[k], 0.0)
+        total += select(load_flags(run.lanes, run.arrived, k), run.message_weight[k], 0.0)
     return total
 
 
@@ -43,8 +42,7 @@ def combine_convex(record: Any, h: int, run: Any) -> None:
     for k in range(run.count):
         m = run.message[k]
         carry(run.model, run, payload.xhat, payload.root, m, run.age[k])
-        arrived = load_flags(lanes, run.arrived, k)
-        weight = select(arrived, run.message_weight[k], 0.0)
+        weight = select(load_flags(lanes, run.arrived, k), run.message_weight[k], 0.0)
         factor = root_of(weight)
         # P + w P_j = A A' with A = [S, sqrt(w) S_j].
         for i in range(n):
@@ -60,9 +58,7 @@ def combine_convex(record: Any, h: int, run: Any) -> None:
 
 @kernel
 def use_readings_heard(record: Any, h: int, run: Any) -> None:
-    """Update node ``h`` with the readings that its messages bring, one after the other: with
-    independent noise that equals one update.
-    """
+    """Update node ``h`` with its messages' readings in turn, for independent noise at once."""
     for k in range(run.count):
         if run.heard[k] >= 0:
             arrived = load_flags(run.lanes, run.arrived, k)

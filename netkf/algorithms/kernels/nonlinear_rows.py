@@ -74,9 +74,7 @@ class NonlinearRows(Struct):
 
 
 def linear_rows(filters: int, p: int, entries: np.ndarray) -> NonlinearRows:
-    """Return the rows of H = ``filters`` filters, all of them linear; of each filter, or of all,
-    ``entries`` (H or 1, n).
-    """
+    """Return linear rows of H = ``filters`` filters; of each, or all, ``entries`` (H or 1, n)."""
     shape, n = (filters, p), entries.shape[1]
     integers = ("kind", "dimensions", "relative", "length")
     scratch: dict[str, tuple[int, ...]] = {
@@ -143,9 +141,7 @@ def read_rows(rows: NonlinearRows, h: int, H: FloatArray, r: int, q: int, out: F
 
 @kernel
 def differentiate_rows(rows: NonlinearRows, h: int, H: FloatArray, r: int, q: int) -> None:
-    """Write the Jacobian at the state ``rows.x`` of the nonlinear rows of filter ``h`` into
-    ``rows.J``.
-    """
+    """Write the Jacobian at ``rows.x`` of the nonlinear rows of filter ``h`` into ``rows.J``."""
     J = rows.J
     for i in range(rows.kind.shape[1]):
         if rows.kind[h, i] in (RANGE, BEARING):
@@ -218,9 +214,7 @@ def move_state(rows: NonlinearRows, x: FloatArray, k: int, q: int, s: int, h: in
 
 @kernel
 def linearise_rows(record: Any, h: int, s: int, run: Any) -> None:
-    """Replace the nonlinear rows of the reading of filter ``h`` in slot number ``s`` of the plan by
-    whitened linear ones.
-    """
+    """Replace nonlinear rows of filter ``h`` in slot ``s`` of the plan by whitened linear ones."""
     linearise_reading(run.nonlinear, record, h, run, run.first_y + h, h, s)
 
 

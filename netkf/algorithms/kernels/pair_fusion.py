@@ -71,8 +71,7 @@ def common_basis(
 def regular_diagonal(root: FloatArray, i: int) -> float:
     """Return entry ``i`` of the diagonal of a lower triangular ``root`` (n, n), in size at least
     SINGULAR (2^-25) times the length of its row: what is smaller is rounding, and two such roots
-    would be thin in directions that rounding tells apart, and their fusion overconfident. P gets
-    no smaller.
+    would be thin in directions that rounding tells apart. P gets no smaller.
     """
     # As in ``intersection.invert_lanes``, the floor grows with the whole root.
     square = TINY
@@ -121,8 +120,7 @@ def orthogonalise(T: FloatArray) -> float:
 @kernel(inlined=True)
 def fused_variance(w: float, b: float, inverse: bool) -> float:
     """Return the variance of the fusion of two scalar estimates with variances 1 (weight ``w``) and
-    ``b`` (weight 1 - w), by inverse covariance intersection if ``inverse``, else by covariance
-    intersection.
+    ``b`` (weight 1 - w), by covariance intersection, the inverse one if ``inverse``.
     """
     # 1/p = 1 + 1/b - 1/m with m = w + (1 - w) b, or 1/p = w + (1 - w) / b.
     if inverse:

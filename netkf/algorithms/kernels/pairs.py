@@ -115,8 +115,7 @@ def write_origin(pairs: Pairs, k: int) -> None:
 @kernel
 def linearise_pair(pairs: Pairs, run: Any, r: int, k: int, q: int) -> None:
     """Write z, J and the covariance of the noise of pair ``k`` of reading number ``r`` in lane
-    ``q`` into ``rows.value`` (p,), ``rows.J`` (p, n) and ``rows.C`` (p, p), at the estimates
-    ``rows.x`` (n,).
+    ``q`` into ``rows.value`` (p,), ``rows.J`` (p, n), ``rows.C`` (p, p), at ``rows.x`` (n,).
     """
     rows, first, matrix = pairs.rows, run.first_y + r, run.first_H + run.matrix[r]
     count, noise = pairs.length[k], min(pairs.slot, len(rows.R) - 1)

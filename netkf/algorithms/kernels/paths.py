@@ -4,8 +4,7 @@ The *path* of a node is its states at the K instants of its window and now, K + 
 numbers, ``record.path`` with the lower triangular root ``record.path_root`` of what the node knows
 by itself. What the sender of a link told is *evidence*: readings with unit noise of the window, of
 which column r of ``record.evidence`` is a row and ``record.evidence_z[r]`` the value. Readings of
-pairs are kept with what linearises them, and are linearised at the beliefs of both nodes whenever a
-message comes.
+pairs are kept with what linearises them, which is done at both beliefs whenever a message comes.
 """
 
 from __future__ import annotations
@@ -165,9 +164,7 @@ def write_present(record: Any, h: int, n: int, q: int) -> None:
 
 @kernel
 def leave_out_oldest(f: PathScratch, n: int, count: int) -> None:
-    """Write the root of the path without its ``n`` oldest states, the next ``count`` ones, from
-    ``S`` into ``square``.
-    """
+    """Write the root ``S`` without the ``n`` oldest states, ``count`` ones, into ``square``."""
     for i in range(count):
         for j in range(n + count):
             f.square[i, j] = f.S[0, n + i, j, 0] if j <= n + i else 0.0
@@ -197,9 +194,7 @@ def eliminate(E: FloatArray, count: int, rows: int, columns: int) -> int:
 
 @kernel
 def mark(record: Any, h: int, n: int, links: tuple[int, int], now: float, q: int) -> None:
-    """Make the present an instant of the window of node ``h``, without the oldest one if that is
-    full.
-    """
+    """Make the present an instant of the window of node ``h``, without the oldest of a full one."""
     K = record.count[h, q]
     if K > 0 and record.times[h, K - 1, q] == now:
         return
@@ -254,9 +249,7 @@ def forget_oldest(record: Any, h: int, n: int, links: tuple[int, int], q: int) -
 
 @kernel
 def load_evidence(record: Any, w: int, out: FloatArray, q: int) -> int:
-    """Write the evidence of link ``w`` into ``out``, its values in the last of d + 1 rows; return
-    of how many readings it is.
-    """
+    """Write the evidence of link ``w`` into ``out``, its values last; return how many readings."""
     last = len(record.work.former) - 1
     for r in range(record.rows[w, q]):
         for j in range(record.evidence.shape[1]):
@@ -428,8 +421,7 @@ def gather_pairs(
     record: Any, h: int, n: int, pairs: Pairs, of: tuple[int, int], mine: bool, M: int, q: int
 ) -> int:
     """Write the readings of a pair that node ``h`` has kept (``mine``), or the sender tells, behind
-    the first ``M`` rows of the scratch; return their number. ``of`` are the number of the link and
-    of the message.
+    the first ``M`` rows of the scratch; return their number. ``of``: numbers of link and message.
     """
     (w, m), f, p, tables = of, record.work, record.payload, record.tables
     for e in range(record.total[h, q] if mine else p.total[m, q]):
@@ -639,9 +631,7 @@ def emit(record: Any, h: int, m: int, run: Any) -> None:
 
 @kernel
 def write_message(record: Any, h: int, m: int, n: int, now: float, q: int) -> None:
-    """Write the belief in the scratch at the instants of the window and ``now`` into payload
-    ``m``.
-    """
+    """Write the belief at the instants of the window and ``now`` into payload ``m``."""
     f, p, K = record.work, record.payload, record.count[h, q]
     # The present is the last instant; the oldest is left out if there are too many.
     count = K if K > 0 and record.times[h, K - 1, q] == now else K + 1
@@ -665,9 +655,7 @@ def write_message(record: Any, h: int, m: int, n: int, now: float, q: int) -> No
 
 @kernel
 def absorb(record: Any, h: int, run: Any) -> None:
-    """Replace the evidence of each sender by that of its message, unless the one that node ``h``
-    has was sent later.
-    """
+    """Replace each sender's evidence by that of its message, unless what is there is newer."""
     f, p, n, links = record.work, record.payload, len(run.size), (run.first[h], run.first[h + 1])
     for q in range(len(run.lanes)):
         if not is_told(record, h, run, q):
@@ -696,9 +684,7 @@ def absorb(record: Any, h: int, run: Any) -> None:
 
 @kernel
 def is_told(record: Any, h: int, run: Any, q: int) -> bool:
-    """Return True if messages have arrived; if one has a reading of node ``h`` of this instant, it
-    becomes one of the window.
-    """
+    """Return True if messages arrived; a reading of ``h`` of this instant enters the window."""
     found, p, now, links = False, record.payload, time_of(run), (run.first[h], run.first[h + 1])
     for k in range(run.count):
         m = run.message[k]
@@ -712,9 +698,7 @@ def is_told(record: Any, h: int, run: Any, q: int) -> bool:
 
 @kernel
 def shift(record: Any, h: int, run: Any) -> None:
-    """Move the present with the origin; states of the window, of which messages are made, keep the
-    coordinates of their time.
-    """
+    """Move the present with the origin; states of the window keep the coordinates of their time."""
     shift_vector(run, record.xhat, h)
     for q in range(len(run.lanes)):
         first = record.count[h, q] * len(run.size)

@@ -84,23 +84,17 @@ class RateRun(Struct):
 
 
 @kernel
-def set_input(model: RateTables, time: float, middle: float) -> None:
-    """Write the input at ``time`` into ``model.u``; it does not jump from there to ``middle``."""
+def _rate_of(
+    model: RateTables, n: int, size: int, time: float, middle: float, state: FloatArray,
+    out: FloatArray,
+) -> None:  # fmt: skip
+    """Write the rates of the first ``size`` numbers of ``state`` = (m, Phi, W) into ``out``."""
     last = count_until(model.times, middle) - 1
     for k in range(len(model.u)):
         model.u[k] = model.values[last, k] if last >= 0 else 0.0
         if last >= 0 and not math.isnan(model.sine[0, k]):
             angle = model.sine[1, k] * time + model.sine[2, k]
             model.u[k] = model.sine[0, k] * math.sin(angle)
-
-
-@kernel
-def _rate_of(
-    model: RateTables, n: int, size: int, time: float, middle: float, state: FloatArray,
-    out: FloatArray,
-) -> None:  # fmt: skip
-    """Write the rates of the first ``size`` numbers of ``state`` = (m, Phi, W) into ``out``."""
-    set_input(model, time, middle)
     call_function(model.f, state[:n], model.u, time, 0.0, model.slope)
     for i in range(n):
         out[i] = model.slope[i]
@@ -136,9 +130,7 @@ def _step(model: RateTables, n: int, size: int, time: float, length: float) -> N
 def move_by_rate(
     model: RateTables, x: FloatArray, root: FloatArray, k: int, end: float, gap: float
 ) -> None:
-    """Predict estimate ``k`` of ``x`` (K, n, 1) and ``root`` (K, n, n, 1) over ``gap`` seconds, to
-    the time ``end``.
-    """
+    """Predict ``x[k]`` (n, 1) and ``root[k]`` (n, n, 1) over ``gap`` seconds, up to ``end``."""
     time, n = end - gap, len(model.slope)
     while time < end:
         stop, later = end, count_until(model.times, time)

@@ -44,9 +44,7 @@ class RiccatiFlow(NamedTuple):
 
 
 def exponential_series(M: FloatArray, terms: int) -> FloatArray:
-    """Return the series (terms, n, n) with ``exp(M g) = sum_k g^k series[k]`` for M (n, n), in its
-    precision.
-    """
+    """Return the series (terms, n, n) with ``exp(M g) = sum_k g^k series[k]``, as precise as M."""
     series = np.empty((terms, *M.shape), dtype=M.dtype)
     series[0] = np.eye(len(M))
     for k in range(1, terms):
@@ -104,8 +102,7 @@ def flow_covariance(A: FloatArray, Q: FloatArray, G: FloatArray, gap: float) -> 
     # By powers of two, so that halving is exact. Doubling also doubles the relative error: after
     # 2^14 parts a triple in double precision would have lost 1e-12.
     doublings = max(0, math.frexp(norm * gap)[1])
-    part = gap / 2.0**doublings
-    F, G, Q = flow_triple(wide_exponential(M, part))
+    F, G, Q = flow_triple(wide_exponential(M, gap / 2.0**doublings))
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(doublings):
             # Symmetry would drift by rounding, and doubling would amplify the drift.
@@ -119,9 +116,7 @@ def flow_covariance(A: FloatArray, Q: FloatArray, G: FloatArray, gap: float) -> 
 
 
 def move_covariances(flow: RiccatiFlow, P: FloatArray) -> FloatArray:
-    """Return the covariances (..., n, n) at the end of the gap of a ``flow``, from those at its
-    begin, ``P`` (..., n, n).
-    """
+    """Return covariances (..., n, n) after the gap of a ``flow``, from ``P`` before it."""
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(flow.parts):
             # P (I + G P)^-1 = (I + P G)^-1 P

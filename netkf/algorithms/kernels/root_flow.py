@@ -6,8 +6,7 @@ noise`` of covariance Q per second and sensors ``dy = H x dt + dv`` with noise o
 Over a gap g, ``P(g) = Q_g + F P (I + G_g P)^-1 F'`` and ``x(g) = exp(A g) x``, where G_g is the
 information that the sensors give during the gap. With ``G_g = Gamma' Gamma`` and ``Q_g = T T'``
 the root moves in three steps that subtract nothing: each row of Gamma is a scalar observation of
-unit noise (estimates.rotate), F multiplies the root, and one elimination adds the columns
-of T.
+unit noise (estimates.rotate), F multiplies the root, and one elimination adds T.
 
 If P is 1e12, rounding errors of G times P would act like information that no sensor gave. So Gamma
 is not computed as a root of G. ``dG/dg = F(s)' H' R^-1 H F(s)``, hence with the coefficients c_j of
@@ -122,9 +121,7 @@ class FlowScratch(Struct):
 
 
 def flow_scratch(table: FlowTable, unrolled: bool = False) -> FlowScratch:
-    """Return scratch arrays for all models of a table. ``unrolled``: kernels that take them are
-    compiled for this n, if it is small.
-    """
+    """Return scratch for all models of a table; ``unrolled``: of types that know a small n."""
     n, q = table.levels.shape[-1], table.whitened_H.shape[1]
     cls = FlowScratch.of_size(n) if unrolled else FlowScratch
     # ``values`` also takes the n n entries of a level, which are fewer.
@@ -263,9 +260,7 @@ def pack_series(parts: FloatArray, observed: bool) -> FloatArray:
 
 
 def whiten_observation(H: FloatArray, R: FloatArray) -> FloatArray:
-    """Return ``R^-1/2 H`` (q, n) for H (p, n) and R (p, p): with q = p rows, or, if p > n, n rows
-    with the same ``H' R^-1 H``.
-    """
+    """Return ``R^-1/2 H`` (p, n); if p > n, n rows with the same ``H' R^-1 H``."""
     p, n = H.shape
     if p == 0:
         return np.zeros((0, n))
@@ -370,8 +365,7 @@ def legendre_moment(k: int, j: int) -> float:
     """Return ``int_0^1 u^k P_j(2 u - 1) du`` = k!^2 / ((k - j)! (k + j + 1)!) for k >= j: what the
     term u^k of a power series adds to its Legendre coefficient c_j, apart from the factor 2 j + 1.
     """
-    value = math.factorial(k) ** 2
-    return value / (math.factorial(k - j) * math.factorial(k + j + 1))
+    return math.factorial(k) ** 2 / (math.factorial(k - j) * math.factorial(k + j + 1))
 
 
 def double_levels(
@@ -428,9 +422,7 @@ def double_levels(
 
 
 def upper_root(rows: FloatArray) -> FloatArray:
-    """Return U (n, n), upper triangular with ``U' U = rows' rows``, in extended precision, for any
-    ``rows`` (k, n).
-    """
+    """Return upper triangular U (n, n), ``U' U = rows' rows``, of ``rows`` (k, n), extended."""
     n = rows.shape[1]
     work = np.concatenate([rows, np.zeros((n, n))]).astype(WIDE)
     for i in range(n):
@@ -453,9 +445,7 @@ def upper_root(rows: FloatArray) -> FloatArray:
 
 
 def cholesky_root(Q: FloatArray) -> FloatArray:
-    """Return the lower triangular root (n, n) of Q (n, n) in its precision; pivots at the level of
-    rounding count as 0.
-    """
+    """Return the lower triangular root of Q (n, n) in its precision; rounding counts as 0."""
     n = len(Q)
     L = np.zeros_like(Q)
     for j in range(n):
@@ -476,9 +466,7 @@ def substitute(lower: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def stack_tables(tables: Sequence[FlowTable]) -> FlowTable:
-    """Return one table of all M models of ``tables``, in their order: their arrays stacked along
-    the first axis.
-    """
+    """Return one table of all M models of ``tables``, in their order, stacked along axis 0."""
 
     def padded(parts: list[FloatArray], fill: float) -> FloatArray:
         """Return the arrays ``parts`` (M_i, ...) of several tables stacked along their first axis,
@@ -504,41 +492,35 @@ def stack_tables(tables: Sequence[FlowTable]) -> FlowTable:
 
 @kernel
 def propagate_root(
-    table: FlowTable,
-    m: int,
-    root: FloatArray,
-    x: FloatArray,
-    k: int,
-    gap: float,
-    scratch: FlowScratch,
+    table: FlowTable, m: int, root: FloatArray, x: FloatArray, k: int, gap: float, work: FlowScratch
 ) -> None:
     """Propagate estimate ``k`` in place over ``gap`` seconds: ``P <- F P (I + G_g P)^-1 F' + Q_g``
     for any P, and the mean by exp(A gap), without the readings.
     """
     # The cells cover 2^octaves units (column 4 of sizes). Of a longer gap, first take whole steps
     # of the level of that length.
-    octaves, values = table.sizes[m, 4], scratch.values
+    octaves, values = table.sizes[m, 4], work.values
     if gap >= table.unit[m] * (1 << octaves):
-        gap = propagate_by_levels(table, m, octaves, root, x, k, gap, scratch)
+        gap = propagate_by_levels(table, m, octaves, root, x, k, gap, work)
     if not gap > 0.0:
         return
     # Without observation (no block of Gamma, column 1 of sizes) any P is narrow.
     observed = table.sizes[m, 1] > 0
-    trace = trace_of_root(ONE, scratch.size, root[k]) if observed else 0.0
+    trace = trace_of_root(ONE, work.size, root[k]) if observed else 0.0
     if is_narrow(table, m, gap, trace):
         cell, since = cell_of(table.unit[m], gap)
         width = table.series.shape[3]
         fill_series(values, width, table.series[m, cell], table.reach[m, cell], 0, since)
-        propagate_by_series(table, m, root, x, k, True, scratch)
+        propagate_by_series(table, m, root, x, k, True, work)
         return
     # P is wide: take whole units by levels, and use the rest of the gap row by row of Gamma, which
     # replaces G_g.
-    gap = propagate_by_levels(table, m, 0, root, x, k, gap, scratch)
+    gap = propagate_by_levels(table, m, 0, root, x, k, gap, work)
     if gap > 0.0:
-        use_information(table, m, root, k, gap, scratch)
+        use_information(table, m, root, k, gap, work)
         width = table.series.shape[3]
         fill_series(values, width, table.series[m, 0], table.reach[m, 0], 0, gap)
-        propagate_by_series(table, m, root, x, k, False, scratch)
+        propagate_by_series(table, m, root, x, k, False, work)
 
 
 @kernel(inlined=True)
@@ -562,9 +544,7 @@ def takes_one_step(table: FlowTable, m: int, gap: float, trace: float) -> bool:
 
 @kernel(inlined=True)
 def trace_of_root(lanes: Lanes, size: Size, S: FloatArray) -> Any:
-    """Return ``trace(P)`` (L,) of P = S S' for lower triangular roots S (n, n, L), one for each of
-    L runs.
-    """
+    """Return ``trace(P)`` (L,) of P = S S' for lower triangular roots S (n, n, L) of L runs."""
     total = spread(lanes, 0.0)
     # |S|_F^2 = trace(S S').
     for i in range(len(size)):
@@ -604,21 +584,13 @@ def propagate_by_levels(
 
 @kernel
 def propagate_level(
-    table: FlowTable,
-    m: int,
-    level: int,
-    root: FloatArray,
-    x: FloatArray,
-    k: int,
-    scratch: FlowScratch,
+    table: FlowTable, m: int, level: int, root: FloatArray, x: FloatArray, k: int, work: FlowScratch
 ) -> None:
-    """Propagate estimate ``k`` in place over ``unit 2^level`` seconds, with the tabulated exp(A g),
-    F, Gamma and T.
-    """
+    """Propagate estimate ``k`` over ``unit 2^level`` s by the tabulated exp(A g), F, Gamma, T."""
     # Index in the third axis of levels: 0 exp(A g), 1 F, 2 Gamma, 3 T. Column 1 of sizes is 0 where
     # nothing is observed.
-    size, n, levels, T = scratch.size, len(scratch.size), table.levels, scratch.T
-    values, row, observed = scratch.values, scratch.observed, table.sizes[m, 1] > 0
+    size, n, levels, T = work.size, len(work.size), table.levels, work.T
+    values, row, observed = work.values, work.observed, table.sizes[m, 1] > 0
     # Gamma_r S for each row r of Gamma, both triangular, as an observation of unit noise.
     for r in range(n if observed else 0):
         for j in range(n):
@@ -626,7 +598,7 @@ def propagate_level(
             for i in range(max(r, j), n):
                 total += levels[m, level, 2, r, i] * root[k, i, j]
             row[0, j] = total
-        rotate(ONE, size, root, k, row[0], scratch.gain[0])
+        rotate(ONE, size, root, k, row[0], work.gain[0])
     # exp(A g) and F where the series of a gap has them.
     begin, flow = n * (n + 1) // 2, offset_of_F(n, observed)
     for i in range(n):
@@ -637,8 +609,8 @@ def propagate_level(
         # A copy, since predict_root_lanes() overwrites T.
         for j in range(i + 1):
             T[i, j] = levels[m, level, 3, i, j]
-    propagate_mean(ONE, size, x[k], values, scratch.moved)
-    predict_root_lanes(ONE, size, root[k], values, flow, scratch.wide, T)
+    propagate_mean(ONE, size, x[k], values, work.moved)
+    predict_root_lanes(ONE, size, root[k], values, flow, work.wide, T)
 
 
 @kernel(inlined=True)
@@ -721,13 +693,10 @@ def propagate_mean(
 
 
 @kernel(inlined=True, fused=True)
-def condition_root(
-    lanes: Lanes, size: Size, S: FloatArray, values: FloatArray, V: FloatArray
-) -> None:
+def condition_root(lanes: Lanes, size: Size, S: FloatArray, w: FloatArray, V: FloatArray) -> None:
     """Replace S (n, n, L), a lower triangular root of P in each of L lanes, by one of
-    ``P (I + G P)^-1``: the update with the information G of the readings of a gap. ``values``
-    (>= width, L) holds the lower triangle of G by rows, behind Q_g, exp(A g) and F; V (n, n, L) is
-    scratch.
+    ``P (I + G P)^-1``: the update with the information G of the readings of a gap. ``w``
+    (>= width, L) holds the triangle of G by rows behind Q_g, exp(A g), F; V (n, n, L) is scratch.
     """
     n = len(size)
     begin = n * (n + 1) // 2 + 2 * n * n
@@ -738,7 +707,7 @@ def condition_root(
             for r in range(j, n):
                 # G is symmetric and packed: (i, r) and (r, i) are one entry.
                 g = i * (i + 1) // 2 + r if r <= i else r * (r + 1) // 2 + i
-                total += load(lanes, values, begin + g) * load(lanes, S, r, j)
+                total += load(lanes, w, begin + g) * load(lanes, S, r, j)
             store(lanes, V, i, j, total)
         for i in range(j + 1):
             total = spread(lanes, 1.0 if i == j else 0.0)
@@ -808,8 +777,7 @@ def use_information(
 @kernel(inlined=True, fused=True)
 def cholesky_in_lanes(lanes: Lanes, size: Size, T: FloatArray, packed: FloatArray) -> None:
     """Write the lower triangular Cholesky factor T (n, n, L) of the symmetric matrices whose lower
-    triangles are ``packed`` (>= n (n + 1) / 2, L) by rows; pivots at the level of rounding count as
-    0.
+    triangles are ``packed`` (>= n (n + 1) / 2, L) by rows; pivots at the level of rounding are 0.
     """
     n = len(size)
     for j in range(n):
@@ -828,17 +796,11 @@ def cholesky_in_lanes(lanes: Lanes, size: Size, T: FloatArray, packed: FloatArra
 
 @kernel(inlined=True, fused=True)
 def predict_root_lanes(
-    lanes: Lanes,
-    size: Size,
-    S: FloatArray,
-    F: FloatArray,
-    begin: int,
-    wide: FloatArray,
-    T: FloatArray,
+    lanes: Lanes, size: Size, S: FloatArray, F: FloatArray, begin: int, W: FloatArray, T: FloatArray
 ) -> None:
     """Replace S (n, n, L) by the lower triangular root of ``F S S' F' + T T'`` in each of L lanes.
     ``F`` (>= begin + n n, L) holds F by rows from index ``begin`` on; T (n, n, L), lower
-    triangular, is overwritten; ``wide`` (n, n, L) is scratch.
+    triangular, is overwritten; ``W`` (n, n, L) is scratch.
     """
     n = len(size)
     # wide = F S; S is lower triangular, so the sum begins at r = j.
@@ -847,8 +809,8 @@ def predict_root_lanes(
             total = spread(lanes, 0.0)
             for r in range(j, n):
                 total += load(lanes, F, begin + i * n + r) * load(lanes, S, r, j)
-            store(lanes, wide, i, j, total)
-    triangularise(lanes, size, S, wide, T)
+            store(lanes, W, i, j, total)
+    triangularise(lanes, size, S, W, T)
 
 
 @kernel(inlined=True, fused=True)

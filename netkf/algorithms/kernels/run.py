@@ -196,9 +196,7 @@ def scratch_of(n: int, L: int) -> dict[str, FloatArray]:
 
 
 def size_of(n: int, unrolled: bool) -> Size:
-    """Return the ``size`` of a run: kernels are compiled for this n where it is small and
-    ``unrolled``.
-    """
+    """Return the ``size`` of a run: of types that know n, if it is small and ``unrolled``."""
     # Loops over one state need no unrolling.
     return sized(n) if unrolled and n > 1 else np.zeros(n)
 
@@ -267,9 +265,7 @@ def carry(model: Any, run: Any, x: FloatArray, root: FloatArray, m: int, age: fl
 
 @generic
 def carry_mean(model: Any, run: Any, x: FloatArray, m: int, age: float) -> None:
-    """Predict the mean ``x[m]`` of ``x`` (K, n, L), of a message ``age`` seconds old, to now; in
-    slots it stays.
-    """
+    """Predict the mean ``x[m]`` (n, L) of a message ``age`` s old to now; in slots it stays."""
 
 
 @generic
@@ -279,9 +275,7 @@ def update_estimate(model: Any, run: Any, x: FloatArray, root: FloatArray, k: in
 
 @generic
 def transition(model: Any, run: Any, x: FloatArray, k: int, out: FloatArray) -> None:
-    """Write the derivative (n, n, L) of what estimate ``k`` is predicted to, ``run.gap`` seconds
-    later, by the estimate, into ``out``.
-    """
+    """Write the derivative (n, n, L) of estimate ``k`` ``run.gap`` seconds later into ``out``."""
 
 
 @transition.register(SlotModelArrays)
@@ -297,9 +291,7 @@ def _transition_of_slot(
 
 @transition.register(ClockTables)
 @kernel
-def _transition_of_gap(
-    model: ClockTables, run: Any, _x: FloatArray, k: int, out: FloatArray
-) -> None:
+def _transition_of_gap(model: ClockTables, run: Any, _x: Any, k: int, out: FloatArray) -> None:
     n = len(run.size)
     for c in range(n):
         for i in range(n):
@@ -521,9 +513,7 @@ def shift_vector(run: Any, x: FloatArray, k: int) -> None:
 
 @kernel
 def shift_product(run: Any, matrix: FloatArray, rows: int, x: FloatArray, k: int) -> None:
-    """Add the first ``rows`` of ``matrix`` (n, n) times ``run.offset`` (n, L) to those of
-    ``x[k]``.
-    """
+    """Add the first ``rows`` of ``matrix`` (n, n) times ``run.offset`` (n, L) to ``x[k]``."""
     for i in range(rows):
         total = load(run.lanes, x, k, i)
         for j in range(len(run.size)):
@@ -611,9 +601,7 @@ def max_increment_interval(record: Any, h: int, run: Any) -> float:
 
 @kernel
 def usable(rate: float) -> float:
-    """Return the longest interval (seconds) of increments for one update, for a ``rate`` of
-    information in 1/s.
-    """
+    """Return the longest interval (s) of increments for one update, by the ``rate`` (1/s)."""
     return MAX_RELATIVE_GAIN / rate if rate > 0.0 else math.inf
 
 

@@ -21,16 +21,12 @@ TINY = 1e-300  # below any squared length of a row that counts, yet above underf
 
 
 def lower_triangular(array: FloatArray) -> FloatArray:
-    """Return L (..., r, r), lower triangular with ``L L' = array array'``, for each matrix of
-    ``array`` (..., r, c), c >= r.
-    """
+    """Return lower triangular L (..., r, r), ``L L' = array array'``, of (..., r, c >= r)."""
     return np.asarray(np.swapaxes(np.linalg.qr(np.swapaxes(array, -1, -2), mode="r"), -1, -2))
 
 
 def lower_root(root: FloatArray) -> FloatArray:
-    """Return the lower triangular S (n, n) with a nonnegative diagonal and ``S S' = root root'``,
-    for any ``root`` (n, c).
-    """
+    """Return lower triangular S (n, n) >= 0 on its diagonal, ``S S' = root root'``, of (n, c)."""
     n, columns = root.shape
     # QR of the transpose needs at least as many columns as rows.
     wide = np.concatenate([root, np.zeros((n, max(n - columns, 0)))], axis=1)
@@ -69,48 +65,41 @@ def reflect(work: FloatArray, i: int, c: int, rows: int, columns: int) -> None:
 
 @kernel(inlined=True, fused=True)
 def reflect_row(
-    lanes: Lanes,
-    size: Size,
-    i: int,
-    end: int,
-    wide: FloatArray,
-    T: FloatArray,
-    square: Any,
-    active: Any,
+    lanes: Lanes, size: Size, i: int, end: int, W: FloatArray, T: FloatArray, square: Any, on: Any
 ) -> None:
     """Apply the Householder reflection from the right that zeroes row ``i`` of [wide, T] except its
     diagonal entry, which becomes nonnegative, to the rows from ``i`` on, in place, in the
-    ``active`` lanes (flags (L,) of runs side by side).
+    ``on`` lanes (flags (L,) of runs side by side).
 
     wide and T are (n, n, L), T lower triangular. Row ``i`` has the squared length ``square`` (L,);
-    in ``wide`` its entries are in columns ``i`` to ``end`` - 1. Row ``i`` itself is not cleared
+    in ``W`` its entries are in columns ``i`` to ``end`` - 1. Row ``i`` itself is not cleared
     right of its diagonal.
     """
     # With v = row i + signed e_i the reflection is I - v v' / (length head).
-    n, pivot = len(size), load(lanes, wide, i, i)
-    length = root_of(select(active, square, 1.0))
+    n, pivot = len(size), load(lanes, W, i, i)
+    length = root_of(select(on, square, 1.0))
     # The sign that does not cancel in pivot + signed; the column is flipped so that its diagonal is
     # nonnegative.
     signed = select(pivot >= 0.0, length, -length)
     head = magnitude(pivot + signed)
-    scale = select(active, 1.0 / (length * head), 0.0)  # 2 / v' v
+    scale = select(on, 1.0 / (length * head), 0.0)  # 2 / v' v
     inverse = scale * head  # 1 / length
-    store(lanes, wide, i, i, select(active, length, pivot))
+    store(lanes, W, i, i, select(on, length, pivot))
     for r in range(i + 1, n):
-        first = load(lanes, wide, r, i)
+        first = load(lanes, W, r, i)
         # Two sums, neither of which waits for the other.
         inner, of_noise = pivot * first, spread(lanes, 0.0)
         for j in range(i + 1, end):
-            inner += load(lanes, wide, i, j) * load(lanes, wide, r, j)
+            inner += load(lanes, W, i, j) * load(lanes, W, r, j)
         for j in range(i + 1):
             of_noise += load(lanes, T, i, j) * load(lanes, T, r, j)
         inner += of_noise
         share = (inner + signed * first) * scale  # v' (row r) 2 / v' v
         # Entry (r, i) is the part of row r along row i: row i becomes (length, 0, ..., 0), and the
         # product of both rows is kept.
-        store(lanes, wide, r, i, select(active, inner * inverse, first))
+        store(lanes, W, r, i, select(on, inner * inverse, first))
         for j in range(i + 1, end):
-            store(lanes, wide, r, j, load(lanes, wide, r, j) - share * load(lanes, wide, i, j))
+            store(lanes, W, r, j, load(lanes, W, r, j) - share * load(lanes, W, i, j))
         for j in range(i + 1):
             store(lanes, T, r, j, load(lanes, T, r, j) - share * load(lanes, T, i, j))
 

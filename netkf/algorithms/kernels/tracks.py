@@ -1,12 +1,10 @@
-"""Kernels for track fusion: the joint covariance of the errors of tracks, and their best
-combination.
+"""Kernels for track fusion: the covariance of the errors of tracks, and their best combination.
 
 A track is the estimate of a node from its own sensors. The common process noise and the common
 initial error correlate the errors e_i of tracks (Bar-Shalom and Campo 1986), so that a combination
 that took them as independent would claim too small a covariance. ``joint`` (K, n, n)
 holds ``P_ij = E[e_i e_j']`` for K ``pairs`` (i, j) of tracks (K, 2), among them all pairs (i, i).
-P_ij is computed from itself, P_ii and P_jj alone, so that its bits do not depend on which other
-pairs there are.
+P_ij is computed from itself, P_ii and P_jj alone: its bits do not depend on other pairs.
 """
 
 from __future__ import annotations
@@ -76,9 +74,7 @@ def predict_joint(joint: FloatArray, F: FloatArray, Q: FloatArray, work: FloatAr
 
 @kernel(inlined=True)
 def multiply_both(left: FloatArray, P: FloatArray, right: FloatArray, work: FloatArray) -> None:
-    """Replace P (n, n) by ``left P right'``, with ``left`` and ``right`` (n, n); ``work`` (n, n) is
-    scratch.
-    """
+    """Replace P by ``left P right'``, all (n, n), with the scratch ``work`` (n, n)."""
     n = len(P)
     # work = left P, complete before P changes; then P = work right'.
     multiply_square(P[0], work, left, P)
@@ -125,8 +121,7 @@ def update_joint(
 @kernel
 def close_row(P: FloatArray, h: FloatArray, closed: FloatArray, k: FloatArray) -> None:
     """Update P (n, n) by one whitened row h (n,), ``P <- (I - k h) P (I - k h)' + k k'`` with the
-    gain ``k = P h' / (h P h' + 1)``, and multiply ``closed`` by ``I - k h`` from the left. ``k``
-    (n,) is scratch.
+    gain ``k = P h' / (h P h' + 1)`` (n,), scratch, and multiply ``closed`` by ``I - k h``.
 
     This is the Joseph form: a rounding error of k changes P in second order only.
     """

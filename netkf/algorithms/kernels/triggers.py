@@ -105,8 +105,7 @@ def is_near(
 @kernel(inlined=True)
 def is_positive(lanes: Lanes, work: FloatArray) -> Any:
     """Return flags (L,) of the symmetric matrices ``work`` (n, n, L), given by their lower
-    triangles, that are positive definite: L D L' elimination, which overwrites them, has positive
-    pivots only.
+    triangles, positive definite: L D L' elimination, which overwrites them, has positive pivots.
 
     Axes: L runs side by side.
     """

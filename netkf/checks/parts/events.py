@@ -80,8 +80,7 @@ def sampling_clocks(scenario: Scenario) -> ClockGroup:
                 return NO_CLOCKS
             entities.append((node, placed_sensor.ordinal))
             rates.append(stated_part(clock, "sampling").mean_rate(entities[-1]))
-            law = law_of.setdefault(placed_sensor.entry, stated_law(clock, "sampling"))
-            laws.append(law)
+            laws.append(law_of.setdefault(placed_sensor.entry, stated_law(clock, "sampling")))
             sensor_label = f"sensor {placed_sensor.ordinal} of " if len(placed_sensors) > 1 else ""
             labels.append(f"the clock of {sensor_label}node {node}")
     return ClockGroup(tuple(entities), np.array(rates), tuple(laws), tuple(labels))
@@ -206,9 +205,7 @@ def _redraws_links(scenario: Scenario) -> bool:
 
 
 def loss_counts(scenario: Scenario, messages: np.ndarray) -> LossCounts | None:
-    """Return counts of sent and lost messages by window and direction, from MESSAGE rows (M,); None
-    without links.
-    """
+    """Return sent and lost counts by window and direction from MESSAGE rows (M,), or None."""
     size, horizon = len(scenario.topology.directions), scenario.horizon
     if not size:
         return None

@@ -86,9 +86,7 @@ def path_law(scenario: Scenario) -> PathLaw | None:
 
 
 def pieces_between(plant: Any, changes: Sequence[Any], start: Any, end: Any) -> Iterator[Any]:
-    """Yield each piece of a plant with ``changes`` from ``start`` to ``end``, and how long it is
-    (seconds, or slots).
-    """
+    """Yield each piece of a plant from ``start`` to ``end``, and its length (seconds, or slots)."""
     cuts = [change for change in changes if start < change < end]
     for begin, stop in itertools.pairwise([start, *cuts, end]):
         yield plant.pieces[bisect.bisect_right(changes, begin)], stop - begin
@@ -282,7 +280,6 @@ class _Grid(NamedTuple):
     end: float
 
     def step_end(self) -> float:
-        """Return the end of the present step in seconds."""
         return self.end
 
 

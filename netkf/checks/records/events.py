@@ -16,7 +16,7 @@ import numpy as np
 
 from netkf.algorithms.filter import may_be_silent
 from netkf.checks.parts.events import redraw_ticks
-from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.linalg.arrays import IntArray
 from netkf.network.clocks import LinkClock, OnReadings
 from netkf.network.matchings import RecordedSlots
 from netkf.plants.recorded import RecordedSensor
@@ -184,26 +184,12 @@ def _absorbed(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
         yield f"node {node} absorbs what never reached it at {at:.9g}"
 
 
-def _compare_times(
-    log: Any, kind: str, node: int, times: FloatArray, expected: FloatArray, horizon: float
-) -> Iterator[str]:
-    """Yield a fault unless the ``times`` (K,) of events of a node are the ``expected`` ones."""
-    tolerance = TIME_TOLERANCE * horizon
-    # Rounding may put the last one on either side of the horizon.
-    inside = expected < horizon - tolerance
-    if len(times) not in (int(inside.sum()), len(expected)):
-        yield f"node {node} has {len(times):,} {kind} events, not {len(expected):,}"
-    elif (k := _first(~(np.abs(times - expected[: len(times)]) <= tolerance))) is not None:
-        yield f"{kind} of node {node} at {times[k]:.9g} s should be at {expected[k]:.9g} s"
-
-
 def _read(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
     if run.status != "complete":
         return
     sampled = scenario.sample_times(Streams(run.seed, run.replica))
-    plant = scenario.plant
-    period = (scenario.diffusion.sensing_period if plant.linear else None) or math.inf
-    senses = log[log["kind"] == SENSE]
+    period = (scenario.diffusion.sensing_period if scenario.plant.linear else None) or math.inf
+    senses, tolerance = log[log["kind"] == SENSE], TIME_TOLERANCE * scenario.horizon
     for node in scenario.sensing_nodes:
         times = [times for (owner, _), times in sampled.items() if owner == node]
         expected = np.unique(np.concatenate([np.empty(0), *times]))
@@ -212,7 +198,12 @@ def _read(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
             grid = period * np.arange(1, count + 1)
             expected = np.sort(np.concatenate([expected, grid[grid < scenario.horizon]]))
         taken = senses["t"][senses["node"] == node]
-        yield from _compare_times(log, "sense", node, taken, expected, scenario.horizon)
+        # Rounding may put the last one on either side of the horizon.
+        inside = expected < scenario.horizon - tolerance
+        if len(taken) not in (int(inside.sum()), len(expected)):
+            yield f"node {node} has {len(taken):,} sense events, not {len(expected):,}"
+        elif (k := _first(~(np.abs(taken - expected[: len(taken)]) <= tolerance))) is not None:
+            yield f"sense of node {node} at {taken[k]:.9g} s should be at {expected[k]:.9g} s"
 
 
 def _ticked(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
@@ -282,8 +273,7 @@ def _slots(scenario: Scenario) -> int:
 def _read_in_slots(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
     if run.status != "complete" or "sense" not in (scenario.node_filter.timing.schedule or ()):
         return
-    first = 0 if scenario.node_filter.timing.predicts else 1
-    expected = np.arange(first, _slots(scenario))
+    expected = np.arange(0 if scenario.node_filter.timing.predicts else 1, _slots(scenario))
     senses = log[log["kind"] == SENSE]
     slots = scenario.slot_plant.slots_of(senses["t"])
     for node in scenario.placed_sensors:

@@ -50,8 +50,7 @@ class FilesUnknownError(Exception):
 
 def files_fault(scenario: Scenario, run: Run, engine: Engine) -> str:
     """Return the first difference between ``run`` and the files that ``netkf run`` and
-    ``netkf.save`` write of it; empty without one. Raises FilesUnknownError if files cannot be
-    written.
+    ``netkf.save`` write of it; empty without one. Raises FilesUnknownError if that fails.
     """
     seeded = dataclasses.replace(scenario, seed=run.seed)
     try:
@@ -284,11 +283,9 @@ def record_promises(audits: Sequence[Audit]) -> tuple[Promise, ...]:
     return tuple(row for row in PROMISES if row.group != ENGINES or not one_engine)
 
 
-def _find_fault(
-    name: str, looked: int, what: str, audits: Sequence[Audit], level: float
-) -> Finding:
+def _find_fault(name: str, seen: int, what: str, audits: Sequence[Audit], level: float) -> Finding:
     """Return the finding on one entry of the audits: broken if it names a fault in any run."""
-    entries = [(k, getattr(audit, name)) for k, audit in enumerate(audits) if audit.looked[looked]]
+    entries = [(k, getattr(audit, name)) for k, audit in enumerate(audits) if audit.looked[seen]]
     known = [(k, entry) for k, entry in entries if not entry.startswith(UNKNOWN)]
     if not known:
         return find_unknown(entries[0][1] if entries else f"{UNKNOWN}no run")

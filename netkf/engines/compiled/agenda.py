@@ -96,8 +96,7 @@ NO_PROGRESS = np.zeros(0, dtype=PROGRESS)
 def is_immediate(scenario: Scenario) -> bool:
     """Return True if filters of a scenario can be simulated in SIMD lanes, as many nodes side by
     side as a vector register holds: exchanges of estimates alone, messages without delay, clocks
-    that do not tick together, and no sensors that take samples. Then no event depends on an
-    estimate.
+    that do not tick together, and no samples. Then no event depends on an estimate.
     """
     node_filter, network = scenario.node_filter, scenario.network
     kernels = compiled_kernels(node_filter, clocked=True)
@@ -215,8 +214,7 @@ def simulate_group(
     """Simulate together the G runs ``first`` to ``first`` + G - 1 of a batch, one for each entry of
     ``progress`` (G,), and store their results in ``batch``. Node h of the k-th of these runs is in
     row k N + h of ``state.xhat``, ``root`` and ``now``. Every ``pause`` simulated seconds the
-    queued visits, predictions of one node or of two that then combine, are processed for all runs
-    at once.
+    queued visits, predictions of one node or of two that combine, are processed for all runs.
     """
     state.first_run = first
     for k in range(len(progress)):
@@ -251,8 +249,7 @@ def simulate_group(
 @kernel
 def move_origin_of_run(state: Simulation, visits: Visits, first: int, now: float) -> None:
     """Predict all nodes of the present run to ``now`` (seconds), where a frame begins, and move the
-    origin of their estimates to the true state. ``first`` is the row of the run's first node in
-    ``state.xhat``.
+    origin of their estimates to the true state. ``first``: the run's first row in ``state.xhat``.
     """
     seek_piece(state, now)
     for h in range(len(state.nodes)):
@@ -273,11 +270,8 @@ def suspend(state: Simulation, batch: BatchArrays, progress: np.ndarray, k: int)
     go on; and its numbers of events in row ``state.run`` of ``batch.counts``.
     """
     position = progress[k]
-    position.tick_at, position.ticks_stop, position.first_delay = (
-        state.tick_at,
-        state.ticks_stop,
-        state.first_delay,
-    )
+    position.tick_at, position.ticks_stop = state.tick_at, state.ticks_stop
+    position.first_delay = state.first_delay
     position.piece, position.grid_at, position.wake_at = state.piece, state.grid_at, state.wake_at
     position.probe_at, position.samples = state.probe_at, state.samples
     for kind in range(len(state.counts)):
@@ -291,11 +285,8 @@ def resume(state: Simulation, batch: BatchArrays, progress: np.ndarray, k: int) 
     simulated together, and its numbers of events from ``batch.counts``.
     """
     position = progress[k]
-    state.tick_at, state.ticks_stop, state.first_delay = (
-        position.tick_at,
-        position.ticks_stop,
-        position.first_delay,
-    )
+    state.tick_at, state.ticks_stop = position.tick_at, position.ticks_stop
+    state.first_delay = position.first_delay
     state.piece, state.grid_at, state.wake_at = position.piece, position.grid_at, position.wake_at
     state.probe_at, state.samples = position.probe_at, position.samples
     state.run = state.first_run + k
@@ -323,8 +314,7 @@ def run_agenda(state: Simulation, visits: Visits, until: float) -> int:
 def queue_events(state: Simulation, visits: Visits, until: float) -> int:
     """Go through the events of the present run before ``until`` (seconds) and queue visits,
     predictions of one node or of two that then combine; return why it stopped (WANT_..., DONE,
-    PAUSE or FULL). Moves the positions ``tick_at``, ``grid_at``, ... of ``state`` behind these
-    events.
+    PAUSE or FULL). Moves the positions ``tick_at``, ``grid_at``, ... of ``state`` on.
     """
     # No event queues more visits: one for each node and a sample, or one for each receiver.
     nodes = len(state.nodes)
@@ -448,8 +438,7 @@ def record_tick(
     """Append to ``state.rows`` a tick at ``now`` (seconds) of node i (and j, -1: none), its
     messages on the directed links ``outgoing[begin:after]``, of which number m - ``begin`` arrives
     if that bit of ``bits`` is 1, and their absorption at ``now`` (messages take no time). Count
-    these messages in ``directions`` and the transmission in ``nodes[i].sent``; i and j are indices
-    of nodes.
+    these messages in ``directions`` and the transmission in ``nodes[i].sent``; i, j are indices.
     """
     nodes, receivers = state.nodes, 0
     record_event(state, now, TICK, nodes[i].id, nodes[j].id if j >= 0 else -1, -1)
@@ -478,8 +467,7 @@ def record_tick(
 @kernel
 def queue_pairs(state: Simulation, visits: Visits, k: int, first: int, now: float) -> None:
     """Queue the visits of tick ``k`` (index in ``state.ticks``) at ``now`` (seconds), some messages
-    of which arrive: one visit of both ends of a link, or one of the sender with each receiver of a
-    broadcast.
+    of which arrive: one visit of both ends of a link, or of the sender with each receiver.
 
     A visit is a record of work to be done later: predict two nodes to ``now`` and combine what
     they sent each other. Visits of one level touch different nodes, so that they are computed side

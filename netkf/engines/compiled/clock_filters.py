@@ -131,9 +131,7 @@ class ClockFilters:
             self.records.begin_elsewhere(arrays, h, 0, moved)
 
     def begin_piece(self, piece: int) -> None:
-        """Let nodes believe the models of a piece of the plant, to whose begin they are
-        predicted.
-        """
+        """Let nodes, predicted to its begin, believe the models of a piece of the plant."""
         model = self.run.model
         if self._rates:
             return

@@ -138,12 +138,7 @@ def restart(record: Any, _h: int, start: Any) -> None:
 
 
 def clock_verbs(
-    kernels: Kernels,
-    record: Any,
-    run: Any,
-    increments: bool,
-    linear: bool = True,
-    models: IntArray = NO_MODELS,
+    kernels: Kernels, record: Any, run: Any, increments: bool, linear: bool, models: IntArray
 ) -> ClockVerbs:
     """Return the verbs of a filter for its record and its run; ``increments``: some nodes read;
     ``linear``: all samples are. Of a run with other than ClockTables nodes may have own ``models``.
@@ -192,8 +187,7 @@ def clock_loop(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs)
             if verbs.remembers == 0 and state.receivers > 0 and ends_instant(state, now):
                 sort_indices(state.waiting, state.receivers)
                 while state.receivers > 0 and find_shortage(state, now) == GO_ON:
-                    h = state.waiting[state.absorbing]
-                    predict_node(state, record, run, verbs, h, now)
+                    predict_node(state, record, run, verbs, state.waiting[state.absorbing], now)
                     on_absorb(state, record, run, verbs, now)
         elif event == ON_ABSORB:
             on_absorb(state, record, run, verbs, now)
@@ -431,18 +425,14 @@ def address_message(
 
 @kernel
 def reading_at(state: Simulation, h: int, now: float) -> int:
-    """Return the instant of the reading of node ``h`` ``now``, which goes with its message, or
-    -1.
-    """
+    """Return the instant of the reading of ``h`` that goes with its message ``now``, or -1."""
     reading = state.nodes[h].reading
     return int(reading) if reading >= 0 and state.instants.t[reading] == now else -1
 
 
 @kernel
 def on_absorb(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, now: float) -> None:
-    """Let the next node absorb all messages of this instant ``now`` (seconds), in the order of
-    senders.
-    """
+    """Let the next node absorb all messages of the instant ``now`` (s), in order of senders."""
     pool, h = state.pool, state.waiting[state.absorbing]
     node, oldest, count = state.nodes[h], 0.0, 0
     if len(run.pairs.row) > 0:
@@ -517,9 +507,7 @@ def whiten_instant(state: Simulation, run: ClockRun, r: int, instant: int) -> No
 
 
 @kernel(inlined=True)
-def whiten_sample(
-    instants: Instants, run: ClockRun, r: int, s: int, row: int, columns: int
-) -> None:
+def whiten_sample(instants: Instants, run: ClockRun, r: int, s: int, row: int, width: int) -> None:
     """Write sample ``s``, whitened, as the rows of reading ``r`` from ``row`` on."""
     sensor, matrix = instants.sensor[s], instants.matrix[s]
     for i in range(instants.rows[sensor]):
@@ -528,7 +516,7 @@ def whiten_sample(
         for k in range(i):
             y -= instants.root[sensor, i, k] * run.y[r, row + k, 0]
         run.y[r, row + i, 0] = y * scale
-        for j in range(columns):
+        for j in range(width):
             entry = instants.H[matrix, i, j]
             for k in range(i):
                 entry -= instants.root[sensor, i, k] * run.H[r, row + k, j, 0]

@@ -58,9 +58,7 @@ def increments(scenario: Scenario) -> list[tuple[int, PlacedSensor]]:
 
 def blocks_at_once(scenario: Scenario) -> int:
     """Return the number of blocks that a run draws at once: few if many sensors need noise."""
-    rows = [
-        len(scenario.sensors[placed_sensor.entry].R) for _, placed_sensor in increments(scenario)
-    ]
+    rows = [len(scenario.sensors[placed.entry].R) for _, placed in increments(scenario)]
     # Two moments for each row of each sensor and step share the budget of normals.
     share = MAX_NORMALS // max(2 * sum(rows), 1)
     return min(MAX_STEP_BLOCKS, max(1, share // BLOCK), blocks_to_the_end(scenario))
@@ -98,9 +96,7 @@ class Paths:
         return self._paths.following(self._blocks, max_steps)
 
     def block(self, block: StepBlock, together: int = 1) -> PathBlock:
-        """Return a block of steps as arrays for the event loop, which simulates ``together`` runs
-        at a time.
-        """
+        """Return a block of steps as arrays for the event loop of ``together`` runs."""
         ends, laws = block.ends, self._paths.laws
         n = laws.n
         # A Struct takes C-contiguous arrays only.
@@ -125,9 +121,7 @@ class Paths:
 
 @cache
 def no_path(n: int) -> PathBlock:
-    """Return a path of one piece without an end, with states that are 0, for runs without increment
-    sensors.
-    """
+    """Return an endless path of states 0, for runs without increment sensors."""
     rows = {name: np.zeros((1, 1, n)) for name in ("x_start", "x_stop")}
     return PathBlock(
         end=math.inf,
@@ -152,18 +146,14 @@ def _sensor_fields(scenario: Scenario) -> tuple[dict[str, np.ndarray], list[tupl
     # Many nodes may have the same sensor: its R is factored once.
     entries = {placed_sensor.entry for _, placed_sensor in placed}
     roots = {entry: cholesky(scenario.sensors[entry].R) for entry in entries}
-    rows = np.array(
-        [len(roots[placed_sensor.entry]) for _, placed_sensor in placed], dtype=np.int64
-    )
+    rows = np.array([len(roots[one.entry]) for _, one in placed], dtype=np.int64)
     # Sensors with fewer rows are padded to the most.
     n, count, max_rows = scenario.plant.n, len(placed), int(rows.max(initial=0))
     H, root = np.zeros((count, max_rows, n)), np.zeros((count, max_rows, max_rows))
     for k, (_, placed_sensor) in enumerate(placed):
         p = rows[k]
-        H[k, :p], root[k, :p, :p] = (
-            scenario.sensors[placed_sensor.entry].H,
-            roots[placed_sensor.entry],
-        )
+        H[k, :p] = scenario.sensors[placed_sensor.entry].H
+        root[k, :p, :p] = roots[placed_sensor.entry]
     index, pooled = scenario.topology.index, scenario.node_filter.timing.pooled
     indices = [0 if pooled else index[node] for node in scenario.increment_sensors]
     shared = {
@@ -206,9 +196,7 @@ class Noise:
         )
 
     def following(self, count: int | None = None) -> None:
-        """Draw the noise of the next block of steps of all runs and sensors into ``sensing``, or
-        only of its first ``count`` steps.
-        """
+        """Draw noise of the next block of steps, or the first ``count``, into ``sensing``."""
         sensing = self.sensing
         # Streams of all runs and sensors, run by run.
         shape = len(sensing.cuts), sensing.steps, *sensing.noise.shape[1:]
@@ -223,15 +211,10 @@ class Noise:
 
 @kernel
 def fill_noise(
-    states: np.ndarray,
-    rows: np.ndarray,
-    ziggurat: Ziggurat,
-    scales: FloatArray,
-    out: FloatArray,
+    states: np.ndarray, rows: np.ndarray, ziggurat: Ziggurat, scales: FloatArray, out: FloatArray
 ) -> None:
     """Write the noise moments of C steps, with standard deviations ``scales`` (2,), into ``out``
-    (K, C, 2, >= p): the next numbers of each of the K = R S streams, that of sensor k modulo S with
-    ``rows`` (S,).
+    (K, C, 2, >= p): the next numbers of each of K = R S streams, of ``rows`` (S,) by sensor.
     """
     for k in range(len(out)):
         # Streams are numbered run by run, so the sensor is the remainder.

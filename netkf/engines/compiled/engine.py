@@ -1,6 +1,4 @@
-"""The compiled engine: schedules drawn before a run, and compiled loops that simulate
-the filters.
-"""
+"""The compiled engine: schedules drawn before a run, and compiled loops that simulate."""
 
 from __future__ import annotations
 

@@ -3,8 +3,7 @@
 The loops, ``clock_loop`` and ``agenda``, find the next event, predict the nodes that take part in
 it, and handle it; events are ordered by (time, rank, entity) as in ``engines.base``. A loop returns
 a request when Python has something to do: draw more random numbers, record rows or samples, enlarge
-a buffer, move the origin. All state is in one struct, so that the next call goes on where it
-stopped.
+a buffer, move the origin. All state is in one struct, with which the next call goes on.
 """
 
 from __future__ import annotations
@@ -155,9 +154,7 @@ def participant(state: Simulation, event: int, k: int) -> int:
 
 @kernel
 def passes_over(state: Simulation, event: int) -> bool:
-    """Return True if the next event is a sample or a tick of nodes that are down, and go on to the
-    one after it.
-    """
+    """Return True for a sample or tick of nodes that are down, and go on to the one after it."""
     if event not in (ON_SAMPLE, ON_TICK):
         return False
     for k in range(count_participants(state, event)):
@@ -211,9 +208,7 @@ def record_event_with_age(
 
 @kernel
 def on_sense(state: Simulation, now: float) -> None:
-    """Record that the next node with increment sensors has used its increments up to ``now``, a
-    point of the sensing grid.
-    """
+    """Record that the next node has used its increments up to ``now``, a point of the grid."""
     sensing = state.sensing
     if state.nodes[sensing.index[state.wake_at]].down == 0:
         record_event(state, now, SENSE, sensing.node[state.wake_at], -1, -1)
@@ -251,9 +246,7 @@ def next_reached(state: Simulation) -> int:
 
 @kernel
 def record_links(state: Simulation, owner: int, now: float) -> None:
-    """Record the links that come up or go down at the tick with number ``owner``, or, -1 - k, at
-    sample k.
-    """
+    """Record links that change at the tick with number ``owner``, or, -1 - k, at sample k."""
     ticks = state.ticks
     while state.link_at < len(ticks.owner) and ticks.owner[state.link_at] == owner:
         link = ticks.link[state.link_at]

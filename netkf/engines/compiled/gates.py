@@ -15,9 +15,7 @@ from netkf.trace.schema import CLIP, REFUSE, SEND, SENSE
 
 
 def ungated_readings(scenario: Scenario) -> str | None:
-    """Return which readings a gate would have to look at that kernels do not; None if it need not,
-    or there is no gate.
-    """
+    """Return readings that a gate would look at and kernels do not; None if it need not."""
     algorithm, kernels = scenario.node_filter, scenario.node_filter.kernels
     if scenario.filter.gate is None:
         return None
@@ -33,18 +31,14 @@ def ungated_readings(scenario: Scenario) -> str | None:
 
 
 def with_refusals(
-    scenario: Scenario,
-    times: SlotTimes,
-    refused: np.ndarray,
-    rows: np.ndarray,
-    before_sample: IntArray,
+    scenario: Scenario, times: SlotTimes, refused: np.ndarray, rows: np.ndarray, before: IntArray
 ) -> tuple[np.ndarray, IntArray]:
     """Return EVENT ``rows`` (K,) of the first run with those of its gates, behind the readings of
-    their slots, and the number of rows before each sample, of ``before_sample`` (T,).
+    their slots, and the number of rows before each sample, of ``before`` (T,).
     """
     setup, (slots, numbers) = slot_setup(scenario), np.nonzero(refused[0, ..., 0])
     if not len(slots):
-        return rows, before_sample
+        return rows, before
     read = np.flatnonzero(rows["kind"] == SENSE)
     read_at = step_times(scenario, setup, times.first, len(times.start)).of_reading(setup)
     now = read_at[slots]
@@ -58,22 +52,18 @@ def with_refusals(
     nodes = np.array([node for parts in setup.gated_parts for *_, node in parts])
     made["node"] = nodes[numbers[known]]
     places = read[last[known] - 1] + 1
-    return insert_rows(rows, places, made, before_sample)
+    return insert_rows(rows, places, made, before)
 
 
 def with_clips(
-    setup: SlotSetup,
-    times: StepTimes,
-    clipped: np.ndarray,
-    rows: np.ndarray,
-    before_sample: IntArray,
+    setup: SlotSetup, times: StepTimes, clipped: np.ndarray, rows: np.ndarray, before: IntArray
 ) -> tuple[np.ndarray, IntArray]:
     """Return EVENT ``rows`` (K,) of the first run with those of clipped messages, behind the first
-    ``send`` of each, and the number of rows before each sample, of ``before_sample`` (T,).
+    ``send`` of each, and the number of rows before each sample, of ``before`` (T,).
     """
     slots, steps, nodes = np.nonzero(clipped[0, ..., 0])
     if not len(slots):
-        return rows, before_sample
+        return rows, before
     phases, ids = np.array(setup.phases, dtype=np.int64), np.sort(setup.nodes)
     now = times.begin[slots, steps]
     moments = np.unique(now)
@@ -97,7 +87,7 @@ def with_clips(
     made["message"] = clipped[0, slots, steps, nodes, 0]
     places = sends[first[np.searchsorted(known, sought[there])]] + 1
     order = np.argsort(places)
-    return insert_rows(rows, places[order], made[order], before_sample)
+    return insert_rows(rows, places[order], made[order], before)
 
 
 def insert_rows(

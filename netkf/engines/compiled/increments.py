@@ -74,9 +74,7 @@ def find_course(state: Simulation, run: int, piece: int) -> int:
 
 @kernel
 def fill_moments_of_piece(state: Simulation, run: int, piece: int, now: float, end: float) -> None:
-    """Write the two moments of x over [now, end] (seconds), inside one ``piece``, into
-    ``scratch.state_moments``.
-    """
+    """Write moments of x over [now, end] (s) of one ``piece`` into ``scratch.state_moments``."""
     path, scratch = state.path, state.scratch
     start, stop = path.start[piece], path.stop[piece]
     # A whole piece has its moments already, drawn from their exact law.
@@ -132,9 +130,7 @@ def fill_moments(state: Simulation, run: int, piece: int, now: float, end: float
 def fill_readings(
     state: Simulation, run: int, h: int, piece: int, now: float, end: float, out: FloatArray
 ) -> None:
-    """Write the two moments of the readings of node ``h`` over [now, end] (seconds), as
-    ``read_increments``.
-    """
+    """Write the moments of readings of node ``h`` over [now, end] (s), as ``read_increments``."""
     fill_moments(state, run, piece, now, end)
     read_increments(state, run, h, piece, now, end, out)
 
@@ -142,8 +138,7 @@ def fill_readings(
 @kernel(inlined=True)
 def next_interval(rate: float, now: float, time: float, least: float) -> tuple[float, float]:
     """Return where the next measurement interval from ``now`` to at most ``time`` (seconds) ends,
-    short against the ``rate`` trace(P G) in 1/s, and the least length of the interval after it, at
-    first 0.
+    short against the ``rate`` trace(P G) in 1/s, and the least next length, at first 0.
     """
     end, interval = time, usable(rate)
     if interval < time - now:

@@ -70,8 +70,7 @@ class LaneReadings(Struct):
 
 def empty_readings(filters: Filters) -> LaneReadings:
     """Return arrays for the readings of L nodes side by side, one in each SIMD lane, with space for
-    the largest number of moments q of any of these filters: two for each row of a node's
-    increments.
+    the largest number of moments q of these filters: two for each row of increments.
     """
     n, q = filters.xhat.shape[1], int(filters.gains.moments.max())
     p, width = q // 2, 2 * course_width(n)
@@ -114,8 +113,7 @@ def load_model(readings: LaneReadings, q: int, m: int, whitened_H: FloatArray) -
 @kernel
 def load_sensor(readings: LaneReadings, q: int, sensing: Sensing, s: int) -> None:
     """Copy H and the root of R of sensor ``s`` (0 to S - 1) into lane ``q`` of ``readings.H`` and
-    ``readings.root``, unless the lane still holds those of a sensor of the same kind (equal H and
-    R).
+    ``readings.root``, unless the lane still holds those of an equal sensor (H and R).
     """
     if readings.kind[q] == sensing.kind[s]:
         return
@@ -131,23 +129,16 @@ def load_sensor(readings: LaneReadings, q: int, sensing: Sensing, s: int) -> Non
 
 @kernel
 def read_alone(
-    state: Simulation,
-    readings: LaneReadings,
-    run: int,
-    h: int,
-    piece: int,
-    now: float,
-    end: float,
-    q: int,
+    state: Simulation, r: LaneReadings, run: int, h: int, piece: int, now: float, end: float, q: int
 ) -> None:
-    """Write the readings of one node, in lane ``q`` of ``readings.moments`` (q, L), by the scalar
+    """Write the readings of one node, in lane ``q`` of ``r.moments`` (q, L), by the scalar
     kernels: for networks in which some node has several sensors, which lanes do not handle. The
     readings are the two moments of each row of increments of node ``h`` (index) of run number
     ``run`` over [now, end] (seconds); ``piece`` is the index of a piece of the path in the step
     that ``end`` lies in.
     """
     count = state.gains.moments[state.nodes[h].model]
-    found, moments = state.scratch.moments[:count], readings.moments
+    found, moments = state.scratch.moments[:count], r.moments
     fill_readings(state, run, h, piece, now, end, found)
     half, rows = len(moments) // 2, count // 2
     for i in range(half):
@@ -158,47 +149,39 @@ def read_alone(
 
 @kernel
 def begin_reading(
-    state: Simulation,
-    readings: LaneReadings,
-    run: int,
-    h: int,
-    piece: int,
-    now: float,
-    end: float,
-    q: int,
+    state: Simulation, r: LaneReadings, run: int, h: int, piece: int, now: float, end: float, q: int
 ) -> None:
     """Prepare the reading of node ``h`` (index) of run number ``run``, which has one sensor, over
     [now, end] (seconds) in lane ``q``: draw its normals and integrate the path of the true state.
     ``piece`` is the index of a piece of the path in the step of the sensing grid that ``end`` lies
-    in. ``end_readings`` then computes the readings of all lanes at once from what is written to
-    ``readings``.
+    in. ``end_readings`` then computes all lanes at once from what is written to ``r``.
     """
     path, sensing, s = state.path, state.sensing, state.nodes[h].sensor
-    load_sensor(readings, q, sensing, s)
-    readings.noise_row[q] = noise_index(sensing, run, s, path.step[piece])
+    load_sensor(r, q, sensing, s)
+    r.noise_row[q] = noise_index(sensing, run, s, path.step[piece])
     last, normals = path.last[piece], state.scratch.cut
-    readings.gap[0, q], readings.remaining[0, q] = end - now, last - now
+    r.gap[0, q], r.remaining[0, q] = end - now, last - now
     # The whole rest needs none: what a lane has is multiplied by 0.
     if end < last:
         draw_cut(sensing, run, s, normals)
         for i in range(sensing.rows[s]):
-            readings.normals[0, i, q], readings.normals[1, i, q] = normals[0, i], normals[1, i]
+            r.normals[0, i, q], r.normals[1, i, q] = normals[0, i], normals[1, i]
     k = piece_of(path, piece, end)
     start, stop = path.start[k], path.stop[k]
     # A whole piece: its moments are drawn already, no polynomial is needed.
     if now == start and end == stop:
-        set_moments(readings, q, path.moments[run, k])
+        set_moments(r, q, path.moments[run, k])
         return
     # Several pieces, or parts of them.
     if now < start:
         fill_moments(state, run, piece, now, end)
-        set_moments(readings, q, state.scratch.state_moments)
+        set_moments(r, q, state.scratch.state_moments)
         return
     # Inside one piece: integrate the polynomial of x there (its course) up to both ends.
     first, share = (now - start) / (stop - start), (end - now) / (stop - start)
-    readings.first[0, q], readings.share[0, q] = first, share
+    r.first[0, q], r.share[0, q] = first, share
     course = path.course[run - state.first_run, find_course(state, run, k)]
-    fill_integrals(readings.rows[q], course, first, first + share)
+    fill_integrals(r.rows[q], course, first, first + share)
 
 
 @kernel

@@ -1,5 +1,4 @@
-"""Power series in the gap for filters in lanes: one table for nodes with increment sensors, one for
-those without.
+"""Power series in the gap for filters in lanes: a table with increment sensors, and one without.
 
 A prediction needs some dozen values that depend on the gap alone (Q_g, exp(A g), F and G_g, see
 kernels.root_flow), and a reading as many gains (kernels.gains). Both are power series; here they
@@ -59,30 +58,20 @@ def series_of_lanes(scenario: Scenario) -> tuple[LaneSeries, LaneSeries]:
     """
     filters = filters_at_start(scenario)
     period = float(scenario.diffusion.sensing_period or 0.0)
-    return unobserved_series(filters), sensing_series(filters, period)
-
-
-def max_moments(filters: Filters) -> int:
-    """Return the largest number q of moments that a node reads over an interval: each of its p rows
-    of increments gives two, its integrals weighted by 1 and by the Legendre polynomial P_1 of the
-    interval.
-    """
-    return int(filters.gains.moments.max())
-
-
-def unobserved_series(filters: Filters) -> LaneSeries:
-    """Return the power series in the gap g of all models without sensors: of exp(A g) and of Q_g,
-    the covariance of the noise over the gap.
-
-    A model is the matrices with which a node predicts. The gap is divided into cells of ``unit``
-    seconds, each with an expansion of its own; the first ``width`` values are Q_g (a triangle) and
-    exp(A g).
-    """
     n, table = filters.xhat.shape[1], filters.table
     # Column 1 counts the blocks of observation rows: 0 if the model has no sensor.
     selected = table.sizes[:, 1] == 0
     width = n * (n + 1) // 2 + n * n
-    return _united(table.series[selected][..., :width], table.unit[selected], selected)
+    # Q_g, the covariance of the noise over the gap g (a triangle), and exp(A g).
+    unobserved = _united(table.series[selected][..., :width], table.unit[selected], selected)
+    return unobserved, sensing_series(filters, period)
+
+
+def max_moments(filters: Filters) -> int:
+    """Return the largest number q of moments that a node reads over an interval: each of its p rows
+    of increments gives two, weighted by 1 and by the Legendre polynomial P_1 of the interval.
+    """
+    return int(filters.gains.moments.max())
 
 
 def sensing_series(filters: Filters, period: float) -> LaneSeries:
@@ -207,8 +196,7 @@ def divide_cells(series: FloatArray, unit: FloatArray) -> tuple[FloatArray, Floa
 def terms_needed(series: FloatArray, unit: FloatArray) -> IntArray:
     """Return the number of terms (cells,) that each cell needs of ``series`` (M, cells, terms, E),
     whose cells are ``unit`` (M,) seconds long: what follows is below rounding at the ends of the
-    cell, for all E entries of all M models. A cell is an interval of the gap with an expansion of
-    its own.
+    cell, for all E entries of all M models. A cell is an interval with an expansion of its own.
     """
     # Largest distance from the expansion point: half a unit from the middle of a cell, a whole unit
     # in the first cell, which is expanded around its start.

@@ -104,9 +104,7 @@ def remove_samples(instants: Instants, lives: LifeTable, index: dict[int, int]) 
 def links_of_lives(
     senders: Senders, listed: Sequence[FloatArray], lives: LifeTable, index: dict[int, int]
 ) -> MovingLinks:
-    """Return which messages of ticks, ``listed`` by entity in seconds, are sent: those of nodes
-    that are up.
-    """
+    """Return which messages of ticks, ``listed`` by entity (s), are sent: of nodes that are up."""
     heard = [np.zeros(0, dtype=bool)] * len(senders.directions)
     for e, times in enumerate(listed):
         for w in senders.outgoing[senders.first[e] : senders.first[e + 1]].tolist():

@@ -90,9 +90,7 @@ class NonlinearSetup:
             function.raise_error()
 
     def tables(self, method: str, active: int) -> NonlinearRows:
-        """Return the rows as kernels take them, for ``active`` runs side by side; ``method`` is how
-        filters linearise.
-        """
+        """Return the rows for kernels and ``active`` runs; ``method``: how filters linearise."""
         rows = linear_rows(*self._shape, self._entries)
         points = [spread_of(method, n) for n in rows.count.tolist()]
         for name in ("kind", "states", "dimensions", "relative", "heading", "length"):

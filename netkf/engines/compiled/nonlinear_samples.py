@@ -66,9 +66,7 @@ class NonlinearTable(Struct):
 
 @kernel
 def linearise_instant(record: Any, h: int, instant: int, table: NonlinearTable) -> None:
-    """Replace the samples of an ``instant`` that are not linear by whitened linear ones, at the
-    estimate of node ``h``.
-    """
+    """Replace nonlinear samples of an ``instant`` by whitened linear ones, for node ``h``."""
     rows, p = table.rows, 0
     for i in range(rows.kind.shape[1]):
         rows.kind[0, i] = LINEAR

@@ -391,8 +391,7 @@ def channel_streams(
 ) -> ChannelStreams:
     """Return the losses and delays of all runs, before anything is drawn. ``bits``: outcomes are
     arrival bits. ``first``: the first message of each direction, where the loss is a KernelLoss
-    whose kernel is called for each. ``listed``: the outcomes of each direction of each run, of a
-    user's channel.
+    whose kernel is called for each. ``listed``: outcomes of a user's channel, by direction and run.
     """
     none: np.ndarray = np.empty((0, WIDTH), dtype=np.uint64)
     loss, delay = channel.loss, channel.delay

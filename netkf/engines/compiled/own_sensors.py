@@ -35,9 +35,7 @@ def reads_as_built_in(sensor: Sensor) -> bool:
 
 
 def reads_in_python(sensor: Sensor, slotted: bool) -> bool:
-    """Return True if Python can read a user's sensor for the engine: in slots, or by samples. Its
-    increments would be drawn by kernels.
-    """
+    """Return True if Python can read a user's sensor: in slots, or by samples."""
     if isinstance(sensor, NonlinearSensor):
         name = "slot_path" if slotted else "samples"
         return getattr(type(sensor), name) is getattr(NonlinearSensor, name)

@@ -47,9 +47,7 @@ class PairExchange(Struct):
 
 
 def pair_exchange(scenario: Scenario, kernels: Kernels, weights: FloatArray) -> PairExchange:
-    """Return the exchange of two nodes whose filters have these ``kernels``, over links with these
-    ``weights`` (W,).
-    """
+    """Return the exchange of two nodes by these ``kernels``, over links of ``weights`` (W,)."""
     n, infos, (model, *_) = scenario.plant.n, scenario.node_infos, scenario.model_pieces[0]
     record = make_records(
         scenario.node_filter,
@@ -108,9 +106,7 @@ def send_both(exchange: PairExchange) -> None:
 
 @kernel
 def receive(exchange: PairExchange, side: int, receivers: IntArray) -> bool:
-    """Let node ``side`` (0 or 1) use what the other sent, in the lanes whose ``receivers`` (L,) are
-    not negative; return False if there is none.
-    """
+    """Let ``side`` (0 or 1) use what the other sent to ``receivers`` (L,) >= 0; False for none."""
     exchange.message[0], exchange.link[0] = 1 - side, side
     done, rows = 0, exchange.weight_row[side]
     for first in range(len(receivers)):

@@ -47,9 +47,7 @@ class Quantiser(Struct):
 
 
 class PayloadQuantiser:
-    """Quantises the payloads of ``records``; ``struct`` is the Quantiser for kernels, whose streams
-    have to be set.
-    """
+    """Quantises payloads of ``records``; ``struct``, for kernels, has no streams set yet."""
 
     def __init__(
         self, quantisation: Quantisation | None = None, records: Records | None = None
@@ -101,9 +99,7 @@ def dither_of(scenario: Scenario, streams: Streams) -> np.ndarray | None:
 
 
 def unquantised_messages(scenario: Scenario) -> str | None:
-    """Return which messages would have to be quantised that kernels do not; None if there are none
-    of few bits.
-    """
+    """Return which messages should be quantised and cannot be by kernels; None without any."""
     kernels = scenario.node_filter.kernels
     if scenario.network.quantise is None or kernels is None:
         return None

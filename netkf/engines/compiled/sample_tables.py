@@ -103,8 +103,7 @@ def kernel_sensors(scenario: Scenario) -> KernelSensors | None:
         indices = np.flatnonzero(np.array(entries) == entry)
         clock: Any = parts[indices[0]].sampling
         own = [keys[k] for k in indices]
-        rates = np.array([clock.mean_rate(key) for key in own])
-        clocks.append((clock, indices, own, rates))
+        clocks.append((clock, indices, own, np.array([clock.mean_rate(key) for key in own])))
         R = cholesky(parts[indices[0]].R)
         root[indices, : len(R), : len(R)] = R
     return KernelSensors(clocks, keys, root)

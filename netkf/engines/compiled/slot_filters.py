@@ -91,7 +91,6 @@ class SlotFilters:
 
     @cached_property
     def _verbs(self) -> SlotVerbs:
-        """The verbs that a run needs."""
         talks, linear = EXCHANGE in self._stages, len(self._run.nonlinear.kind) == 0
         return slot_verbs(self.kernels, self.records.struct, self._run, talks, linear)
 
@@ -140,8 +139,7 @@ class SlotFilters:
     def _lay_out_stages(self) -> None:
         """Set the stages of a slot, with the phase and the number of steps of each."""
         timing = self._setup.algorithm.timing
-        kinds = timing.schedule or ()
-        stages = [kind for kind in kinds if timing.talks or kind != "exchange"]
+        stages = [kind for kind in timing.schedule or () if timing.talks or kind != "exchange"]
         self._stages = np.array([_KINDS[kind] for kind in stages], dtype=np.int64)
         exchange = np.cumsum(self._stages == EXCHANGE) - 1
         self._phases = np.where(self._stages == EXCHANGE, exchange, -1)
@@ -152,7 +150,6 @@ class SlotFilters:
 
     @cached_property
     def _start(self) -> dict[str, np.ndarray]:
-        """The arrays of all records at time 0."""
         return {name: array.copy() for name, array in self.records.arrays.items()}
 
     def restart(self, h: int, moved: FloatArray) -> None:
@@ -163,9 +160,7 @@ class SlotFilters:
         self.begin_elsewhere(h, 0, moved)
 
     def begin_elsewhere(self, h: int, lane: int, moved: FloatArray) -> None:
-        """Let filter ``h``, which is at its start, begin ``moved`` (n,) away from it in a lane of
-        the first block.
-        """
+        """Let filter ``h`` begin ``moved`` (n,) away from its start, in a lane of block 0."""
         if moved.any():
             first = {name: array[0] for name, array in self.records.arrays.items()}
             self.records.begin_elsewhere(first, h, lane, moved)

@@ -282,9 +282,7 @@ def exchange(
 def quantise_messages(
     plan: SlotPlan, b: int, s: int, e: int, h: int, nodes: int, sent: tuple[int, int]
 ) -> None:
-    """Quantise what node ``h`` has ``sent``, the first payload and how many these are, in all lanes
-    in which it is sent.
-    """
+    """Quantise what ``h`` has ``sent``, (first payload, count), in all lanes that send it."""
     lanes = plan.speaks.shape[4]
     for q in range(lanes):
         silent = len(plan.sent) > 0 and plan.sent[b, s, e, h, q] == 0
@@ -358,18 +356,11 @@ def write_slot_sample(
 ) -> None:  # fmt: skip
     """Write the sample of slot ``s`` of block ``b``: ``xhat`` (H, n, L), ``root`` (H, n, n, L)."""
     k, lanes, entries = plan.sample[s], run.lanes, samples.entries
-    n, first, all_local, all_absolute = (
-        len(run.size),
-        b * len(lanes),
-        samples.local,
-        samples.absolute,
-    )
+    n, first = len(run.size), b * len(lanes)
+    all_local, all_absolute = samples.local, samples.absolute
     means, errors, covariances = samples.sampled_xhat, samples.sampled_error, samples.sampled_P
-    sum_of_all, states, framed = (
-        load(lanes, samples.total, b),
-        all_absolute.shape[2],
-        samples.framed,
-    )
+    sum_of_all = load(lanes, samples.total, b)
+    states, framed = all_absolute.shape[2], samples.framed
     for h in range(len(xhat)):
         for i in range(n):
             entry = entries[h, i] if len(entries) > 0 else i
@@ -403,12 +394,8 @@ def write_slot_sample(
 
 
 @kernel
-def scatter_sample(
-    lanes: Lanes, values: FloatArray, samples: FloatArray, indices: np.ndarray
-) -> None:
-    """Write one sample, ``values`` (>= C, L), into ``samples`` (R, C): lane q into row
-    ``indices[q]``; -1: no run.
-    """
-    count = samples.shape[1]
+def scatter_sample(lanes: Lanes, values: FloatArray, out: FloatArray, indices: np.ndarray) -> None:
+    """Write ``values`` (>= C, L) into ``out`` (R, C): lane q at ``indices[q]``, -1: nowhere."""
+    count = out.shape[1]
     for c in range(0, count, len(lanes)):
-        scatter(lanes, values, c, samples, indices, min(count - c, len(lanes)))
+        scatter(lanes, values, c, out, indices, min(count - c, len(lanes)))

@@ -168,8 +168,7 @@ def draw_messages(
                 for r in range(b * len(lanes), min((b + 1) * len(lanes), runs)):
                     for a in range(messages.pair_count[r, s, e] if matched else len(links.ends)):
                         link = messages.active[r, s, e, a] if matched else a
-                        q = r - b * len(lanes)
-                        draw_link(links, r, link, fresh[e], e, now, arrived, q)
+                        draw_link(links, r, link, fresh[e], e, now, arrived, r - b * len(lanes))
 
 
 @kernel
@@ -214,8 +213,7 @@ def draw_link(
     links: SlotChannels, r: int, link: int, fresh: bool, e: int, t: float, up: np.ndarray, q: int
 ) -> None:
     """Draw which messages of one activation of ``link`` arrive in step ``e`` of run ``r``, which
-    begins at ``t`` seconds, into lane ``q`` of ``up`` (W, L). Unless it is ``fresh`` a link keeps
-    its last draws.
+    begins at ``t`` seconds, into lane ``q`` of ``up`` (W, L). Links that are not ``fresh`` stay.
     """
     channels, uniform, last = links.channels, links.uniform, -1
     for w in range(link * links.per_link, (link + 1) * links.per_link):
@@ -317,9 +315,7 @@ class TracedNodes(NamedTuple):
 
 
 class EventRows(NamedTuple):
-    """Columns (K,) of the event table of one run (trace.schema), and the number of rows before each
-    of T samples, ``before_sample`` (T,).
-    """
+    """Columns (K,) of a run's events (trace.schema); ``before_sample`` (T,): rows before each."""
 
     t: FloatArray
     kind: np.ndarray
@@ -513,24 +509,18 @@ def count_sends(
 
 @kernel
 def mark_senders(
-    links: SlotChannels,
-    messages: SlotMessages,
-    exchanged: np.ndarray,
-    runs: int,
-    speaks: np.ndarray,
+    links: SlotChannels, messages: SlotMessages, exchanged: np.ndarray, runs: int, says: np.ndarray
 ) -> None:
-    """Set ``speaks`` (B, S, E, N, L) to 1 for nodes with links to send on, in the slots that are
-    ``exchanged`` (S,), in each of the ``runs``.
-    """
-    paired, lanes = len(messages.pair_count) > 0, speaks.shape[4]
+    """Set ``says`` (B, S, E, N, L) to 1 for nodes with links in ``exchanged`` (S,) slots."""
+    paired, lanes = len(messages.pair_count) > 0, says.shape[4]
     for r in range(runs):
         for s in range(len(exchanged)):
-            for e in range(speaks.shape[2] if exchanged[s] else 0):
+            for e in range(says.shape[2] if exchanged[s] else 0):
                 for a in range(messages.pair_count[r, s, e] if paired else len(links.ends)):
                     link = messages.active[r, s, e, a] if paired else a
                     for end in range(links.per_link):
                         if links.talks[e, link * links.per_link + end] == 1:
-                            speaks[r // lanes, s, e, links.ends[link, end], r % lanes] = 1
+                            says[r // lanes, s, e, links.ends[link, end], r % lanes] = 1
 
 
 @kernel

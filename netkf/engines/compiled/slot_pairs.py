@@ -44,9 +44,7 @@ class PairColumns:
         return self.other(h, support)
 
     def others(self, h: int, sensor: Any, node: int) -> dict[int, Place]:
-        """Return by anchor the blocks beside those of filter ``h`` that a sensor of a node (id)
-        reads.
-        """
+        """Return by anchor the blocks beside those of filter ``h`` that a node's sensor reads."""
         found = {anchor: self.of_reading(h, sensor, anchor) for anchor in anchors_of(sensor, node)}
         return {anchor: place for anchor, place in found.items() if place is not None}
 
@@ -91,9 +89,7 @@ class SlotPairs:
         return self.columns.others(s.estimator, sensor, s.node)
 
     def add(self, s: Any, row: int, others: dict[int, Place]) -> int:
-        """Add an AssignedSensor, with its first value in ``row``; return the number of its first
-        pair.
-        """
+        """Add an AssignedSensor, its first value in ``row``; return its first pair's number."""
         sensor: Any = self._scenario.located_sensors[s.placed_sensor.entry]
         anchor, place = next(iter(others.items()))
         first = len(self.all)

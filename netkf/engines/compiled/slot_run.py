@@ -266,9 +266,7 @@ class SlotRuns:
         samples = self.samples if self.samples is not None else self._empty_samples(len(sampled))
         # Kernels take flat entries for each sample. Explicit lengths, since reshape(-1) fails for
         # the empty arrays of a block without a sample.
-        x, xhat, P, error = (
-            part.reshape(*part.shape[:2], math.prod(part.shape[2:])) for part in samples
-        )
+        x, xhat, P, error = (a.reshape(*a.shape[:2], math.prod(a.shape[2:])) for a in samples)
         kernel_samples = SlotSamples(
             x=x, xhat=xhat, P=P, error=error, absolute=absolute, local=local,
             framed=drawn and absolute is not local, total=self._total,
@@ -379,9 +377,7 @@ class SlotRuns:
         offsets = np.cumsum([math.prod(shape) for shape in shapes])
         # One allocation for all: numpy requests huge pages for large ones, which are cheap to get.
         arrays = np.split(_samples.array(int(offsets[-1])), offsets[:-1])
-        return SampledStates(
-            *(part.reshape(shape) for part, shape in zip(arrays, shapes, strict=True))
-        )
+        return SampledStates(*(a.reshape(shape) for a, shape in zip(arrays, shapes, strict=True)))
 
     @property
     def broken(self) -> np.ndarray:
@@ -593,13 +589,11 @@ class SlotRuns:
             x[:, rebased] = 0.0
         # The states from which sensors with a random H draw it.
         k = setup.sensors.C.shape[2]
-        regressor_states: FloatArray = unset((len(self._regressors), self._blocks, count, k, LANES))
-        for path, (steps, states) in zip(regressor_states, self._regressors, strict=True):
+        regressors: FloatArray = unset((len(self._regressors), self._blocks, count, k, LANES))
+        for path, (steps, states) in zip(regressors, self._regressors, strict=True):
             self._draw_path(steps, states, path, path)
         noise, scratch = self._noise, np.zeros((setup.p, LANES))
-        draw_readings(
-            MANY, setup.sensors, noise, normal_ziggurat(), x, regressor_states, scratch, y, H
-        )
+        draw_readings(MANY, setup.sensors, noise, normal_ziggurat(), x, regressors, scratch, y, H)
         if self._nonlinear is not None and setup.nonlinear is not None:
             responses = self._scenario.input_responses
             if responses is not None and responses.believed is not None:
@@ -629,7 +623,6 @@ class SlotRuns:
                     readings[b, :, lane] = bad.given(self._slot + k, healthy)
 
     def _silence(self, y: FloatArray, H: FloatArray) -> None:
-        """Take away the readings of nodes that are down."""
         setup, times = self.setup, self._step_times(y.shape[1])
         for r, tables in enumerate(self._tables):
             down = absent(setup, tables.lives, times)
@@ -700,11 +693,8 @@ class SlotRuns:
         y[:, sensed, h, rows] = 0.0 if sensor.linear else np.nan
         for k in np.flatnonzero(sensed).tolist():
             for m, (values, anchor, R) in enumerate(path.readings_at(self._slot + k, s.R)):
-                place, pair, first = (
-                    setup.columns.of_reading(h, sensor, anchor),
-                    s.pair + m,
-                    s.row + m * p,
-                )
+                place = setup.columns.of_reading(h, sensor, anchor)
+                pair, first = s.pair + m, s.row + m * p
                 if place is not None:
                     first = int(pairs.row[pair])
                     pairs.block[k, pair] = setup.columns.number(place)
@@ -758,9 +748,7 @@ class SlotRuns:
         nonlinear.R[k, s.estimator, rows, rows] = R
 
     def events(self, block: SlotBlock) -> tuple[np.ndarray, np.ndarray]:
-        """Return the EVENT rows (K,) of a block of one run, and the number of rows before each of
-        its samples, (T,).
-        """
+        """Return a run's EVENT rows (K,) of a block, and how many precede each sample, (T,)."""
         if self._tables:
             # Tables know the events, but not in which slot nodes stopped, and what gates refused.
             rows, before_sample = self._tables[0].events(block.sampled, self._stopped[0, :, 0])
@@ -793,9 +781,7 @@ class SlotRuns:
             rows = self._rows(block, first, min(first + size, count), before_sample)
             yield self._with_decisions(block, rows, before_sample)[0]
 
-    def _rows(
-        self, block: SlotBlock, first: int, stop: int, before_sample: np.ndarray
-    ) -> np.ndarray:
+    def _rows(self, block: SlotBlock, first: int, stop: int, before: np.ndarray) -> np.ndarray:
         setup = self.setup
         # Space for the largest number of rows.
         table = np.empty(setup.rows_of(stop - first), dtype=EVENT)
@@ -804,7 +790,7 @@ class SlotRuns:
         nodes = TracedNodes(setup.nodes, setup.sensing, setup.links, self._sent, self._stopped)
         trace = Tracing(
             setup.stages, block.times, self._channels, nodes, block.messages,
-            EventRows._make([*columns, before_sample]), setup.algorithm.timing.pairwise,
+            EventRows._make([*columns, before]), setup.algorithm.timing.pairwise,
         )  # fmt: skip
         count = make_rows(trace, first, stop)
         return table[:count]
@@ -923,7 +909,7 @@ MAX_EVENT_ROWS = 1 << 15
 
 
 def slot_batches(
-    scenario: Scenario, seed: int, replicas: range, fingerprint: bool = False
+    scenario: Scenario, seed: int, replicas: range, fingerprint: bool
 ) -> Iterator[RunBatch]:
     """Yield the results of consecutive ``replicas``, as many runs at a time as fit the memory; with
     ``fingerprint`` the hash of the events of the first run.
@@ -938,9 +924,7 @@ def slot_batches(
         yield slot_batch(scenario, seed, range(first, first + count), with_fingerprint)
 
 
-def slot_batch(
-    scenario: Scenario, seed: int, replicas: range, fingerprint: bool = False
-) -> RunBatch:
+def slot_batch(scenario: Scenario, seed: int, replicas: range, fingerprint: bool) -> RunBatch:
     """Simulate R consecutive ``replicas`` side by side. A run that diverges goes on to the end with
     invalid numbers, which ``with_ends`` replaces.
     """

@@ -187,9 +187,7 @@ class SlotSetup:
 
     @cached_property
     def gated_parts(self) -> list[list[tuple[int, int, int]]]:
-        """First row and number of rows of each reading of each filter, and the node (id) that takes
-        it: a table may have several.
-        """
+        """First row, number of rows and node (id) of each reading of each filter; tables share."""
         parts: list[list[tuple[int, int, int]]] = [[] for _ in range(self.estimators)]
         for s in self.assigned:
             p = len(s.R)
@@ -403,9 +401,7 @@ class SlotSetup:
         return bool(self._recorded_slots)
 
     def unread(self, first: int, count: int) -> np.ndarray:
-        """Return (S, E, N) bool: nodes that have no reading to send in a step, in ``count`` slots
-        from ``first`` on.
-        """
+        """Return (S, E, N) bool: nodes with nothing to send, in ``count`` slots from ``first``."""
         missed = np.zeros((count, len(self.nodes)), dtype=bool)
         for index, slots in self._recorded_slots.items():
             missed[:, index] = [slot not in slots for slot in range(first, first + count)]
@@ -427,9 +423,7 @@ class SlotSetup:
         return self.has_known_probabilities and network.channel.delay.fixed == 0.0 and exchanges
 
     def activity(self, slots: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return (S,) bool: whether events of these ``slots`` (S,) are recorded, whether nodes act,
-        and whether they exchange.
-        """
+        """Return (S,) bool for ``slots``: whether events are recorded, nodes act, and exchange."""
         timing, recorded = self.algorithm.timing, slots < self.last
         # At the horizon filters that predict are only sampled: the prediction is the result.
         acts = recorded | (not timing.predicts)
@@ -470,9 +464,7 @@ class SlotSetup:
         return 8 * floats + messages + len(self.fresh) * asked
 
     def block_slots(self, runs: int, max_events: int) -> int:
-        """Return the number of slots of ``runs`` runs that one call simulates, with about
-        ``max_events`` events at most (0: no limit).
-        """
+        """Return how many slots of ``runs`` one call simulates, by ``max_events`` (0: no limit)."""
         slots = BLOCK_BYTES // (blocks_of(runs) * LANES * self.bytes_of_slot())
         if max_events:
             slots = min(slots, max_events // max(1, self.rows_of(1)))
@@ -552,9 +544,5 @@ def matching_lists(scenario: Scenario) -> tuple[int, float, np.ndarray, np.ndarr
         lists = [[index[link] for link in members] for members in maximal_matchings(links)]
     probability = {ONE_EDGE: activation.lazy, INDEPENDENT: activation.p}.get(protocol) or 0.0
     first = np.cumsum([0, *map(len, lists)], dtype=np.int64)
-    return (
-        protocol,
-        probability,
-        first,
-        np.array([k for members in lists for k in members], dtype=np.int64),
-    )
+    flat = np.array([k for members in lists for k in members], dtype=np.int64)
+    return protocol, probability, first, flat

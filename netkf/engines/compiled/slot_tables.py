@@ -213,9 +213,7 @@ class SlotTables:
             self._shared_drawn = np.zeros(len(scenario.nodes), dtype=np.int64)
 
     def asked(self, times: StepTimes) -> np.ndarray:
-        """Return (E, N) flags: nodes that are asked for a message in each step of the next slot,
-        with these ``times``.
-        """
+        """Return (E, N) flags: nodes asked for a message in each step of a slot at ``times``."""
         setup, uses = self._setup, self._begin_block(times)
         asked = np.zeros((len(setup.fresh), len(setup.nodes)), dtype=np.uint8)
         if self._timing.pairwise:
@@ -256,8 +254,7 @@ class SlotTables:
         slot, step, place, link, ups = self._used_links(times)
         each, senders = self._setup.directions_per_link, self._setup.senders
         # A link is drawn for even if nobody sends, so that the network does not depend on filters.
-        fresh = self._setup.fresh[step]
-        number = numbers_of(link, fresh, self._drawn)
+        number = numbers_of(link, self._setup.fresh[step], self._drawn)
         slot, step, place, number = (np.repeat(c, each) for c in (slot, step, place, number))
         w = (link[:, None] * each + np.arange(each)).ravel()
         draws = self._draws.rows(senders.source[w], number)
@@ -282,9 +279,7 @@ class SlotTables:
             known = ~np.isnan(common)
             own[known] = common[known]
 
-    def _transmissions(
-        self, uses: Uses, count: int
-    ) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+    def _transmissions(self, uses: Uses, count: int) -> tuple[IntArray, ...]:
         """Return slot, step and sender (K,) of transmissions, and which (D,) each use has."""
         steps, nodes = len(self._setup.fresh), len(self._ids)
         key = (uses.slot * steps + uses.step) * nodes + self._sender[uses.w]
@@ -386,8 +381,7 @@ class SlotTables:
             self.awake = (~down).astype(np.uint8)
             sends &= ~down[uses.slot, uses.step, sender]
         if setup.may_miss:
-            unread = setup.unread(times.first, len(times.start))
-            sends &= ~unread[uses.slot, uses.step, sender]
+            sends &= ~setup.unread(times.first, len(times.start))[uses.slot, uses.step, sender]
         if setup.quantise is not None:
             self.speaks = np.zeros((*times.begin.shape, len(setup.nodes)), dtype=np.uint8)
             self.speaks[uses.slot[sends], uses.step[sends], sender[sends]] = 1
@@ -507,7 +501,6 @@ class SlotTables:
         return self._ids[self._sender[messages.w]], self._ids[self._receiver[messages.w]]
 
     def _rows_of_outcomes(self, ended: Messages, part: IntArray, *order: Any) -> UnorderedRows:
-        """Return the rows with which messages end."""
         sender, receiver = self._ends_of(ended)
         lost, never = ended.outcome == LOST, np.isnan(ended.arrival)
         age = self._grid.snap(ended.arrival - ended.sent)
@@ -620,8 +613,7 @@ class SlotTables:
         for name, column in zip(COLUMNS[1:], of_event, strict=True):
             table[name] = column[order]
         last = 1 if self._timing.predicts else self._parts - 1
-        before = np.searchsorted(part[order], sampled * self._parts + last, side="right")
-        return table, before
+        return table, np.searchsorted(part[order], sampled * self._parts + last, side="right")
 
     def _stops(self, slot: IntArray, times: StepTimes) -> UnorderedRows:
         """Return the rows of nodes that stop in these slots (N,) of the block."""

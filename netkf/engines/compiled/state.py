@@ -440,9 +440,7 @@ def entity_records(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
 def scratch_arrays(
     table: FlowTable, gains: Gains, unrolled: bool, n: int
 ) -> tuple[Scratch, FlowScratch]:
-    """Return scratch arrays for models with these tables of a plant of ``n`` states; ``unrolled``:
-    of types that know n.
-    """
+    """Return scratch for models of a plant of ``n`` states; ``unrolled``: of types that know n."""
     max_moments, width = int(gains.moments.max()), gains.series.shape[2]
     scratch = Scratch(
         moments=np.zeros(max_moments),

@@ -228,9 +228,7 @@ def end_of_run(t: FloatArray, source: IntArray, begin: int, count: int) -> int:
 def put_in_time_order(
     begin: float, end: float, count: int, buffer: TickBuffer, ordered: TickBuffer, sorting: Sorting
 ) -> None:
-    """Sort the first ``count`` ticks of ``buffer``, about evenly in [begin, end) seconds, by (time,
-    entity) into ``ordered``.
-    """
+    """Sort the first ``count`` ticks, even over [begin, end) s, into ``ordered``."""
     # Ticks are evenly spread, hence about one in each of ``count`` equal bins.
     place, source, scale = sorting.place, sorting.source, count / (end - begin)
     # Counting sort by bin: count, sum up, and place.
@@ -349,9 +347,7 @@ def _list_ticks(
     instants: Instants | None,
     lives: LifeTable,
 ) -> list[FloatArray] | None:
-    """Return the instants (K,) of all ticks of each entity of each run (R E), in seconds; None
-    where kernels draw them.
-    """
+    """Return the ticks (K,) of each entity and run (R E), in s; None where kernels draw them."""
     network = scenario.network
     if senders.at == "readings":
         assert instants is not None
@@ -388,8 +384,7 @@ def clocks_of(
     per_second: float,
 ) -> Clocks:
     """Return the clocks of E ``entities`` in all runs, before their first ticks, which send on
-    nothing; ``rates`` (E,) are their ticks per second, ``purposes`` of their streams for ticks and
-    for phases.
+    nothing; ``rates`` (E,): their ticks per second, ``purposes`` of streams for ticks and phases.
     """
     count = len(entities) * streams.runs
     kind, low, width, number = EXPONENTIAL_GAPS, 0.0, 0.0, np.zeros(count, dtype=np.int64)
@@ -538,9 +533,7 @@ class Schedule:
         self._end, self._buffer = 0.0, _empty_buffer(0, 0)
 
     def following(self) -> TickArrays:
-        """Return the next window of one run, sorted by (time, entity); the last ends at
-        infinity.
-        """
+        """Return a run's next window, sorted by (time, entity); the last ends at infinity."""
         begin, end = self._end, self._instant(self._end + self._length)
         # The last window has no end, so that the loop asks for no other.
         if not begin < end < self._horizon:
@@ -549,8 +542,7 @@ class Schedule:
         last, counts = min(end, self._horizon), np.zeros(2, dtype=np.int64)
         # Space for the mean plus eight standard deviations of a Poisson count is nearly always
         # enough.
-        expected = self._rate * (last - begin)
-        ticks = _space_for_count(expected, 8.0)
+        ticks = _space_for_count(self._rate * (last - begin), 8.0)
         sends = int(self._sends * ticks) + self._max_sends
         while True:
             self._enlarge_buffer(ticks, sends)

@@ -32,9 +32,7 @@ class PathStates:
         return x
 
     def rebase(self, k: int) -> FloatArray:
-        """Return the local state (n,) of the first run just before ``frame_times[k]``, and make the
-        state of each run its origin.
-        """
+        """Return the first run's state (n,) before ``frame_times[k]``; states become origins."""
         x = self.path.x_stop[:, np.searchsorted(self.path.stop, self.frame_times[k])]
         self._offsets.append(x)
         return np.asarray(x[0])

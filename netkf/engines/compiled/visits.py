@@ -214,8 +214,7 @@ def append_visit(
     """Add a visit, the prediction to ``time`` (seconds) of the nodes at the places ``first`` and
     ``second`` (rows of ``state.xhat``; NO_NODE or ALL_NODES: see VISIT), to ``visits.records`` and
     to the list of ``level``; return its index. Visits of one level have no node in common and are
-    computed side by side, level after level. Run and piece of the path are the present ones of
-    ``state``.
+    computed side by side, by level. Run and piece are the present ones of ``state``.
     """
     v = visits.count
     visits.count = v + 1
@@ -409,8 +408,7 @@ def fill_rates(state: Simulation, visits: Visits, count: int) -> None:
     size, readings = state.size, visits.readings
     for q in range(count):
         interval = visits.intervals[ring_index(visits, visits.first_interval + q)]
-        visit = visits.records[interval.visit]
-        h = node_at(state, visit.run, interval.place)
+        h = node_at(state, visits.records[interval.visit].run, interval.place)
         load_model(readings, q, state.nodes[h].model, state.table.whitened_H)
     # Both for all lanes at once, before the length of each lane's interval is chosen.
     store(MANY, readings.rate, 0, information_rate(MANY, size, readings.whitened_H, visits.S))
@@ -421,13 +419,10 @@ def fill_rates(state: Simulation, visits: Visits, count: int) -> None:
 def begin_interval(state: Simulation, visits: Visits, q: int) -> None:
     """Take the next measurement interval from the ring buffer, whose node is in SIMD lane ``q``,
     and decide how long it is: assign its prediction to the lane, or predict the node at once by
-    scalar kernels if P is too wide for one step. Queues the rest of the gap to the visit's time, if
-    any.
+    scalar kernels if P is too wide for one step. Queues the rest of the gap, if any.
     """
-    interval, readings = (
-        visits.intervals[ring_index(visits, visits.first_interval)],
-        visits.readings,
-    )
+    interval = visits.intervals[ring_index(visits, visits.first_interval)]
+    readings = visits.readings
     place, now, v = interval.place, interval.now, interval.visit
     visits.first_interval += 1
     visit = visits.records[v]
@@ -465,8 +460,7 @@ def assign_lane(
 def read_increments_in_lanes(state: Simulation, visits: Visits, count: int) -> None:
     """Write the moments of the increments that the nodes in the first ``count`` SENSING lanes
     (those of nodes with increment sensors) read, each over the interval of its lane, into
-    ``visits.readings.moments`` (q, L), q moments in L lanes; lanes whose place is NO_NODE read
-    nothing.
+    ``visits.readings.moments`` (q, L), q moments in L lanes; lanes of NO_NODE read nothing.
     """
     places, readings = visits.places[SENSING], visits.readings
     # Lanes without a node take no noise.
@@ -553,8 +547,7 @@ def predict_sensing(state: Simulation, visits: Visits, count: int) -> None:
     copy_columns(visits.columns, visits.sensing.column, width, len(visits.gains), visits.gains)
     predict_lanes(state, visits, True)
     # P includes the readings of the gap already (F and G_g); now they correct the estimate.
-    moments = visits.readings.moments
-    use_moments(MANY, state.size, visits.S, visits.x, visits.gains, moments)
+    use_moments(MANY, state.size, visits.S, visits.x, visits.gains, visits.readings.moments)
     scatter_states(state, places, visits.x, visits.S)
 
 
@@ -564,8 +557,7 @@ def evaluate_series(
 ) -> None:
     """Evaluate the power series from which the node in lane ``q`` of ``kind`` (UNOBSERVED or
     SENSING: without or with increment sensors) is predicted: that of its model in ``series``, at
-    the lane's gap. Write the W' values into ``rows[q]`` of ``rows`` (L, W'), one row for each of L
-    lanes.
+    the lane's gap. Write the W' values into ``rows[q]`` of ``rows`` (L, W'), one for each lane.
     """
     lane = visits.lanes[kind, q]
     row = series.row[lane.model]
@@ -577,9 +569,7 @@ def evaluate_series(
 
 @kernel
 def transpose_rows(rows: FloatArray, out: FloatArray) -> None:
-    """Write the transpose of ``rows`` (L, W'), one row of W' values for each of L lanes, into
-    ``out`` (W', L).
-    """
+    """Write the transpose of ``rows`` (L, W'), a row for each lane, into ``out`` (W', L)."""
     for j in range(0, rows.shape[1], LANES):
         turn(MANY, rows, j, out)
 
@@ -603,11 +593,9 @@ def predict_lanes(state: Simulation, visits: Visits, reads: bool) -> None:
     G_g P)^-1 F', with G_g = 0 and F = exp(A g) unless ``reads``.
     """
     size, n, values = state.size, len(state.size), visits.values
-    S, V, T = (
-        local_lanes_matrix(size, MANY, visits.old_S),
-        local_lanes_matrix(size, MANY, visits.V),
-        local_lanes_matrix(size, MANY, visits.T),
-    )
+    S = local_lanes_matrix(size, MANY, visits.old_S)
+    V = local_lanes_matrix(size, MANY, visits.V)
+    T = local_lanes_matrix(size, MANY, visits.T)
     # Local arrays of a size known at compile time stay in registers.
     for i in range(n):
         for j in range(i + 1):

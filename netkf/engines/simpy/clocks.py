@@ -33,9 +33,7 @@ def clock_processes(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> list[Process]:
-    """Return one SimPy process for each link, direction or node that has a clock; none if nodes
-    transmit after their samples.
-    """
+    """Return a process for each entity with a clock; none if nodes transmit after samples."""
     activation = scenario.network.activation
     if not scenario.node_filter.timing.talks or not isinstance(activation, LinkClock):
         return []

@@ -23,21 +23,16 @@ class DrivenModel:
 
     def __init__(self, scenario: Scenario, model: Any, view: np.ndarray | None = None) -> None:
         response: Any = scenario.believed_response
-        self._model, self._response = model, response
+        self.undriven, self._response = model, response
         self._view: Any = slice(None) if view is None else view
         self._grid = scenario.time_grid
         self._period = scenario.slot_plant.period if scenario.slotted else None
         self.start = self.end = 0.0
         self._predicted = False
 
-    @property
-    def undriven(self) -> Any:
-        """The model that knows no input."""
-        return self._model
-
     def __getattr__(self, name: str) -> Any:
         """Return what the input does not change."""
-        return getattr(self.__dict__["_model"], name)
+        return getattr(self.__dict__["undriven"], name)
 
     def _m(self, time: float) -> FloatArray:
         at = time if self._period is None else round(time / self._period)
@@ -61,18 +56,16 @@ class DrivenModel:
     ) -> tuple[FloatArray, FloatArray]:
         """Return estimate (n,) and root (n, n) after the whole ``gap``, see ``Model``."""
         self._predicted = self._grid.instant(self.start + gap) == self.end
-        moved, root = self._model.predict(xhat - self._m(self.start), root, gap)
+        moved, root = self.undriven.predict(xhat - self._m(self.start), root, gap)
         return moved + self._m(self.end), root
 
     def extrapolate(
         self, xhat: FloatArray, root: FloatArray, age: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return estimate (n,) and root (n, n) ``age`` seconds after a received one, see
-        ``Model``.
-        """
+        """Return estimate (n,) and root (n, n) ``age`` s after a received one, see ``Model``."""
         if self._period is not None or age <= 0.0:
             return xhat, root
-        moved, root = self._model.extrapolate(xhat - self._m(self.end - age), root, age)
+        moved, root = self.undriven.extrapolate(xhat - self._m(self.end - age), root, age)
         return moved + self._m(self.end), root
 
     def gain_update(
@@ -82,6 +75,6 @@ class DrivenModel:
         those of the response to the input are known.
         """
         of_m = moments_over(self._response, self.start, self.end, self._grid)[:, self._view]
-        known = of_m @ self._model.H.T
+        known = of_m @ self.undriven.H.T
         local, m = moments - known.reshape(-1), self._m(self.end)
-        return np.asarray(self._model.gain_update(xhat - m, root, local, gap) + m)
+        return np.asarray(self.undriven.gain_update(xhat - m, root, local, gap) + m)

@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,6 @@ from netkf.engines.base import Engine, Progress, Rank, broken
 from netkf.engines.reach import Reach
 from netkf.engines.simpy.clocks import clock_processes
 from netkf.engines.simpy.driven import DrivenModel
-from netkf.engines.simpy.membership import Membership
 from netkf.engines.simpy.nodes import ClockedNode, Node, View, distinct
 from netkf.engines.simpy.sensors import increment_sensors, sensor_processes
 from netkf.engines.simpy.slots import FIRST_RANK, Reader, SlotClock, SlotNode, SlotSchedule
@@ -25,10 +25,12 @@ from netkf.engines.simpy.transmission import Transmitter
 from netkf.engines.soundness import sound_mask, stack_estimates
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.plain import announce_plain
+from netkf.network.lives import Lifetime, lifetimes
 from netkf.network.node_clocks import node_time
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
-from netkf.trace.recorder import Recorder
+from netkf.trace.recorder import NAN, Recorder
+from netkf.trace.schema import CODES
 
 
 class DivergedError(Exception):
@@ -85,7 +87,7 @@ class _Simulation:
         self.timeline = Timeline()
         self._scenario, self._streams = scenario, streams
         self._recorder, self._progress = recorder, progress
-        self._membership = Membership(scenario, streams, recorder)
+        self._membership = _Membership(scenario, streams, recorder)
         self._transmitter = Transmitter(
             scenario, streams, self.timeline, recorder, self._membership.up
         )
@@ -204,8 +206,7 @@ class _Simulation:
         if scenario.node_filter.timing.talks:
             shared = (scenario, streams, recorder, schedule, self._transmitter, nodes)
             processes.append(SlotClock(*shared).run_process(self.timeline))
-        sums = _Sums(distinct(nodes))
-        return [self._sampling_slots(truth, schedule, nodes, sums), *processes]
+        return [self._sampling_slots(truth, schedule, nodes, _Sums(distinct(nodes))), *processes]
 
     def _sampling_slots(
         self, truth: Any, schedule: SlotSchedule, nodes: dict[int, SlotNode], sums: _Sums
@@ -214,8 +215,7 @@ class _Simulation:
 
         def sample() -> None:
             if schedule.sampled(slot):
-                time = schedule.start(slot)
-                self._record(time, slot, truth, nodes, sums)
+                self._record(schedule.start(slot), slot, truth, nodes, sums)
             # The origin moves after the sample, which still refers to the old one.
             if truth.frame_slots and slot and slot % truth.frame_slots == 0:
                 offset = -truth.rebase(slot)
@@ -366,3 +366,43 @@ class _Sums:
         """Return the sums (at the start, now) by name."""
         now = self._compute()
         return {name: (first, now[name]) for name, first in self.start.items()}
+
+
+class _Membership:
+    """Which nodes are up now; all of them without ``network.lives``."""
+
+    def __init__(self, scenario: Scenario, streams: Streams, recorder: Recorder) -> None:
+        self._recorder, self._index = recorder, scenario.topology.index
+        self._fresh_estimate, self._horizon = scenario.fresh_estimate, scenario.horizon
+        self._lives = lifetimes(scenario, streams)
+        self._down = {node for node, life in self._lives.items() if not life.up}
+
+    def up(self, *nodes: int) -> bool:
+        """Return True if one of these nodes (ids) is up."""
+        return not self._down.issuperset(nodes)
+
+    def processes(self, timeline: Timeline, nodes: dict[int, Any]) -> list[Process]:
+        """Return a process for each node that goes up or down in the run."""
+        for node in self._down:
+            nodes[node].set_up(False, 0.0)
+        return [
+            self._live(timeline, node, life, nodes[node])
+            for node, life in self._lives.items()
+            if life.changes
+        ]
+
+    def _live(self, timeline: Timeline, node: int, life: Lifetime, carrier: Any) -> Process:
+        for change in life.changes:
+            # Before anything else of this instant, but for a move of the origin.
+            yield timeline.at(change.time, Rank.LIFE, self._index[node])
+            code = CODES[change.kind]
+            if change.time < self._horizon:
+                self._recorder.append((change.time, code, node, -1, -1, -1, NAN))
+            carrier.set_up(change.up, change.time)
+            if change.up:
+                self._down.remove(node)
+                if life.forgets:
+                    carrier.restart(change.time, partial(self._fresh_estimate, node))
+            else:
+                self._down.add(node)
+                carrier.inbox.clear()

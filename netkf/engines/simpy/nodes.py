@@ -134,9 +134,7 @@ class View:
 
 
 class SeenPart:
-    """A ``function`` that linearises readings of a state of n components, for a node that estimates
-    its ``entries`` (n',).
-    """
+    """Linearises readings of a state of n by a ``function``, for a node of ``entries`` (n',)."""
 
     def __init__(self, function: Any, entries: np.ndarray, n: int) -> None:
         self._function, self._entries, self._n = function, entries, n
@@ -210,8 +208,7 @@ class Node:
     ) -> None:
         """Set up the filter with its ``model`` and its estimate ``start`` = (xhat (n,), P (n, n))
         at time 0, and an empty inbox; ``node`` is an id, ``entity`` an index, ``points`` are those
-        by which nonlinear sensors are linearised, and ``view`` says which states it estimates, if
-        not all.
+        by which nonlinear sensors are linearised, and ``view`` its states, if not all.
         """
         self._points, self.view, self._gate = points, view, gate
         self.node, self.entity, self.info, self.model = node, entity, info, model
@@ -232,7 +229,6 @@ class Node:
         """Go up or down at ``time`` (seconds)."""
 
     def _predict(self, start: float, gap: float) -> None:
-        """Predict the filter over ``gap`` seconds from ``start`` on."""
         if isinstance(self.model, DrivenModel):
             self.state = self.model.advance(self.algorithm, self.state, start, gap)
             return
@@ -245,9 +241,7 @@ class Node:
         return self.estimate()
 
     def estimate(self) -> tuple[FloatArray, FloatArray | None]:
-        """Return copies of the estimate (n,) and its covariance (n, n), None if it has none; raises
-        ValueError if the filter gives others.
-        """
+        """Return copies of estimate (n,) and covariance (n, n) or None; raises ValueError."""
         xhat, P = self.algorithm.estimate(self.state)
         mean = _numbers("xhat", xhat, (self.width,))
         if P is None:
@@ -260,9 +254,7 @@ class Node:
         return mean, cov
 
     def put(self, envelope: Envelope) -> None:
-        """Put a message into the inbox; with ``newest_only`` the newest of a sender replaces
-        others.
-        """
+        """Put a message into the inbox; with ``newest_only`` only a sender's newest stays."""
         envelopes = self.inbox.setdefault(envelope.sender, [])
         if self._timing.newest_only and envelopes:
             # Delays may differ: a message that arrives later may have been sent earlier.
@@ -286,13 +278,10 @@ class Node:
             own = self.algorithm.emit(self.state, exchange)[1]
         messages = [Message(e.sender, e.weight, self._translated(e, own), e.age) for e in envelopes]
         if self._gate is not None:
-            messages = [
-                m._replace(payload=self._gated_payload(m, time, recorder)) for m in messages
-            ]
+            messages = [m._replace(payload=self._gated(m, time, recorder)) for m in messages]
         return envelopes, messages
 
-    def _gated_payload(self, message: Message, time: float, recorder: Recorder) -> Any:
-        """Return a payload with its reading as the gate lets it pass."""
+    def _gated(self, message: Message, time: float, recorder: Recorder) -> Any:
         payload, reading = message.payload, getattr(message.payload, "reading", None)
         whole = isinstance(payload, Payload) and payload.sender.kernels.sends_whole_readings
         # Errors of estimates are correlated in an unknown way with those of the node.
@@ -311,13 +300,10 @@ class Node:
         if common is None:
             return envelope.payload
         before = partial(state_before, self.model, age=envelope.age)
-        translate = self.algorithm.needs.translate
-        return translate(envelope.payload, own, Common(*common, before))
+        return self.algorithm.needs.translate(envelope.payload, own, Common(*common, before))
 
     def linearise(self, samples: Sequence[Sample]) -> Sequence[Sample]:
-        """Return samples in which matrices at the present estimate replace the functions that
-        nonlinear sensors have in place of H.
-        """
+        """Return samples with matrices at the estimate in place of nonlinear functions."""
         functions = [sample for sample in samples if not isinstance(sample[1], np.ndarray)]
         if not functions:
             return samples
@@ -446,9 +432,7 @@ class ClockedNode(Node):
         return mean, cov
 
     def set_up(self, up: bool, time: float) -> None:
-        """Use increments from ``time`` (seconds) on, or no more; a filter that all nodes share has
-        none of nodes that go down.
-        """
+        """Use increments from ``time`` (s) on, or no more; a shared filter, those of nodes up."""
         if self._increments and self.node >= 0:
             self.predict_to(time)
             self.moving_model.set_reading(up)
@@ -529,10 +513,7 @@ class ClockedNode(Node):
         # One update with all samples: R is block diagonal, since sensors have independent noise.
         known = self.linearise(self.gated(samples, time, self._recorder))
         nothing = np.empty(0), np.empty((0, self.width))
-        y, H = (
-            np.concatenate([nothing[part], *(sample[part] for sample in known)])
-            for part in range(2)
-        )
+        y, H = (np.concatenate([nothing[part], *(s[part] for s in known)]) for part in range(2))
         R = block_diagonal([R for *_, R in known])
         reading = Reading(y, H, R, self._now, tuple(pair for _, pair in pairs))
         self.state = self.algorithm.update(self.state, reading)

@@ -90,9 +90,7 @@ class SamplingProcess:
     def run(
         self, timeline: Timeline, truth: Any, receiver: ClockedNode, up: Callable[[int], bool]
     ) -> Process:
-        """Read the ``truth`` at the sample times, and pass each sample to ``receiver`` if the node
-        is ``up``.
-        """
+        """Read ``truth`` at the sample times, for ``receiver`` if the node is ``up``."""
         for k, time in enumerate(self.times.tolist()):
             yield timeline.at(time, Rank.SENSE, self.entity)
             # Relative to the moving origin, like the estimates.
@@ -106,13 +104,11 @@ def increment_sensors(
 ) -> list[SensorPath]:
     """Return the readings of the increment sensors ``placed`` (node, sensor) in one run."""
     paths = []
-    for node, placed_sensor in placed:
-        sensor = scenario.sensors[placed_sensor.entry]
+    for node, one in placed:
+        sensor = scenario.sensors[one.entry]
         assert isinstance(sensor, LinearSensor)
         # Noise on the grid and the division of steps have separate streams, so that the noise on
         # the grid does not depend on the network.
-        noise, division = (
-            streams.generator(p, node, placed_sensor.ordinal) for p in ("noise", "cut")
-        )
+        noise, division = (streams.generator(p, node, one.ordinal) for p in ("noise", "cut"))
         paths.append(sensor.path(noise, division))
     return paths

@@ -174,8 +174,7 @@ class SlotNode(Node):
         if stage.kind == "predict":
             self._slot = slot + self._timing.predicts
             # A filtered estimate is of the slot before.
-            start = self._schedule.start(slot - (not self._timing.predicts))
-            self._predict(start, self._period)
+            self._predict(self._schedule.start(slot - (not self._timing.predicts)), self._period)
         elif stage.kind == "update":
             self._update(stage.time)
         else:
@@ -360,9 +359,7 @@ class SlotClock:
         exchange = Exchange(now, phase, stage.step, slot)
         # All payloads are computed before any message arrives: the order of nodes does not matter.
         awake = self._transmitter.up
-        payloads = {
-            node: self._nodes[node].emit(exchange) if awake(node) else None for node in senders
-        }
+        payloads = {i: self._nodes[i].emit(exchange) if awake(i) else None for i in senders}
         # Held links keep their outcome for all steps of an exchange.
         fresh = self._timing.redraws(phase, stage.step)
         self._transmitter.begin(senders_of_pairs(pairs, self._scenario.topology.directed), fresh)

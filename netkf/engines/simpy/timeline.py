@@ -29,9 +29,7 @@ class Timeline(simpy.Environment):
         self.processes += 1
         self.process(self._watched(process))
 
-    def _watched(
-        self, process: Generator[simpy.Event, Any, Any]
-    ) -> Generator[simpy.Event, Any, Any]:
+    def _watched(self, process: Process) -> Process:
         try:
             return (yield from process)
         except BaseException as error:
@@ -39,9 +37,7 @@ class Timeline(simpy.Environment):
             raise
 
     def run(self, until: Any = None) -> Any:
-        """Run as SimPy does; raises what a process raised, of which SimPy raises a copy that is
-        made of its ``args`` alone.
-        """
+        """Run as SimPy does; raises what a process raised, which SimPy copies by ``args`` alone."""
         try:
             return super().run(until)
         except BaseException:

@@ -236,9 +236,7 @@ class Transmitter:
         return self._encoded[sender][1]
 
     def _stamped(self, link: Link, envelope: Envelope) -> Envelope:
-        """Return a message with the age that its stamp tells the receiver, from 0 to the time since
-        the start.
-        """
+        """Return a message with the age that its stamp tells, up to the time since the start."""
         sender, receiver = (self._clocks[node] for node in link)
         now, stamp = receiver.shows(self._timeline.now), sender.shows(envelope.sent)
         age = min(max(self._instant(now - stamp), 0.0), self._instant(now - receiver.shows(0.0)))
@@ -266,8 +264,7 @@ class Transmitter:
 class LinkExchange:
     """The directions of one link: a single one if the graph is directed, else both.
 
-    In each activation every end sends to the other. With a symmetric channel both directions share
-    one outcome.
+    In each activation every end sends to the other. Symmetric channels share one outcome.
     """
 
     def __init__(

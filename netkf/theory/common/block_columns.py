@@ -76,8 +76,7 @@ class BlockColumns(ErrorColumns):
         self._filter: Any = algorithm if algorithm.kernels is None else KernelColumns(algorithm)
         self.estimators, self.n = len(scenario.nodes), scenario.width
         plant = cast(Any, scenario.plant)
-        rank = plant.start_root.shape[1]
-        self._used: int = NOISE + rank
+        self._used: int = NOISE + plant.start_root.shape[1]
         self._x = np.zeros((plant.n, 2 * plant.n + SPARE))
         self._x[:, MEAN], self._x[:, NOISE : self._used] = plant.start_mean, plant.start_root
         self._views: list[View | None] = [None] * self.estimators
@@ -190,8 +189,7 @@ class SlotBlocks(BlockColumns):
 
     def __init__(self, scenario: Scenario, run: Run) -> None:
         super().__init__(scenario, run)
-        plant = scenario.linear_plant
-        self._laws = [(piece.F, square_root(piece.Q)) for piece in plant.pieces]
+        self._laws = [(piece.F, square_root(piece.Q)) for piece in scenario.linear_plant.pieces]
         self._observe = slot_observations(scenario, run, _apart)
         # By slot, phase and step what each receiver heard: sender (twice) and age.
         self._arrivals: dict[Step, dict[int, list[tuple[int, int, float]]]] = {}

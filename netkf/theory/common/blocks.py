@@ -97,8 +97,7 @@ class SeenErrors(ErrorColumns):
         return self._whole.replay()
 
     def _forms(self) -> FloatArray:
-        forms = self._whole._forms()
-        return np.asarray(padded(forms.T, 1).T[self._rows.ravel()])
+        return np.asarray(padded(self._whole._forms().T, 1).T[self._rows.ravel()])
 
     def covariances(self) -> FloatArray:
         """Return P (M, n, n), with the variance 1 of states that a node does not estimate."""

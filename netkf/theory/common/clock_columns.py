@@ -231,8 +231,7 @@ class ClockColumns(LoggedColumns):
         self._filters.run.now = shown
         if self._clocks:
             # Its model changes when its clock shows the time of a change.
-            piece = bisect.bisect_right(self._followed, shown)
-            self._filters.clocked.begin_piece(piece)
+            self._filters.clocked.begin_piece(bisect.bisect_right(self._followed, shown))
         gap, self._times[h] = shown - self._times[h], shown
         return gap
 
@@ -242,9 +241,7 @@ class ClockColumns(LoggedColumns):
         return time if clock is None else clock.shows(time)
 
     def _ahead(self, h: int, time: float) -> FloatArray:
-        """Return by how much the origin of the estimates of node h is ahead of that of the truth at
-        ``time``, (n,).
-        """
+        """Return by how much (n,) the origin of node h is ahead of the truth's at ``time``."""
         assert self._response is not None
         shown, true = self._response.states(np.array([self._clock_reading(h, time), time]))
         return np.asarray(shown - true)

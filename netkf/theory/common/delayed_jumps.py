@@ -119,7 +119,10 @@ class DelayedJumps:
     @cached_property
     def _integral(self) -> FloatArray:
         """Integrals (k + 1, k + 1) in seconds: row a integrates collocation values from 0 to a."""
-        return self.delay * chebyshev_integrals(self.points)
+        x = 2.0 * chebyshev_points(self.points) - 1.0
+        coefficients = np.linalg.inv(np.polynomial.chebyshev.chebvander(x, self.points))
+        integrals = np.polynomial.chebyshev.chebint(coefficients, lbnd=-1.0, axis=0)
+        return self.delay * np.asarray(0.5 * np.polynomial.chebyshev.chebval(x, integrals).T)
 
     @cached_property
     def _drift_blocks(self) -> FloatArray:
@@ -179,14 +182,6 @@ class DelayedJumps:
         right = np.zeros((self.points + 1, *Phi.shape))
         right[0] = Phi
         return right
-
-    def _driven_by_noises(self) -> FloatArray:
-        """Return the right-hand side (k + 1, M, M) for the noises of plant and readings."""
-        heard = self._mean[1] @ np.tile(self._message_noise[0], (1, self.nodes, 1))
-        right = np.tensordot(self._integral, heard, 1)
-        jump_noise = self._inflow(self._moments(np.zeros_like(right), noise=True))
-        right[0] = self.instant.noise + 2.0 * symmetric(heard[0]) + jump_noise
-        return np.asarray(right)
 
     def _residual(self, K: FloatArray, right: FloatArray, jumps: bool) -> FloatArray:
         """Return the residuals (k + 1, M, M) of K(s) = E[E(t) E(t - s)'] and ``right``."""
@@ -291,13 +286,15 @@ class DelayedJumps:
     @cached_property
     def covariance(self) -> FloatArray:
         """E[E E'] (1, M, M) under all noises and jumps."""
-        return symmetric(self._autocovariances(self._driven_by_noises(), jumps=True)[:1])
+        heard = self._mean[1] @ np.tile(self._message_noise[0], (1, self.nodes, 1))
+        right = np.tensordot(self._integral, heard, 1)
+        jump_noise = self._inflow(self._moments(np.zeros_like(right), noise=True))
+        right[0] = self.instant.noise + 2.0 * symmetric(heard[0]) + jump_noise
+        return symmetric(self._autocovariances(np.asarray(right), jumps=True)[:1])
 
     @cached_property
     def mean_is_stable(self) -> bool:
-        """True if the mean of errors dies out, by their map over d seconds (Breda, Maset, Vermiglio
-        2015).
-        """
+        """True if mean errors die out, by their map over d s (Breda, Maset, Vermiglio 2015)."""
         K, M = self.points + 1, len(self.instant.drift)
 
         def next_means(y: FloatArray) -> FloatArray:
@@ -318,11 +315,3 @@ class DelayedJumps:
 def chebyshev_points(K: int) -> FloatArray:
     """Return the extreme points (K + 1,) of the Chebyshev polynomial of degree K on [0, 1]."""
     return np.asarray(0.5 * (1.0 - np.cos(np.pi * np.arange(K + 1) / K)))
-
-
-def chebyshev_integrals(K: int) -> FloatArray:
-    """Return the matrix (K + 1, K + 1) from values at Chebyshev points to integrals up to each."""
-    x = 2.0 * chebyshev_points(K) - 1.0
-    coefficients = np.linalg.inv(np.polynomial.chebyshev.chebvander(x, K))
-    integrals = np.polynomial.chebyshev.chebint(coefficients, lbnd=-1.0, axis=0)
-    return np.asarray(0.5 * np.polynomial.chebyshev.chebval(x, integrals).T)

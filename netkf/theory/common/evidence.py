@@ -92,9 +92,7 @@ def no_channel_law(scenario: Scenario) -> str:
 
 @lru_cache(maxsize=8)
 def lacks_channel_law(scenario: Scenario) -> bool:
-    """Return True if losses or delays are read from a table, nodes move or are down, or the loss
-    does not say how often messages arrive.
-    """
+    """Return True if outcomes are recorded, nodes move or are down, or the loss has no law."""
     unstated = (math.isnan(scenario.mean_delivery(link)) for link in scenario.topology.directions)
     return _is_recorded(scenario) or scenario.network_changes or any(unstated)
 

@@ -82,9 +82,7 @@ def refusals(scenario: Scenario, node: int, placed: PlacedSensor) -> Refusals | 
 
 
 def innovation_biases(alone: _Alone, biases: FloatArray) -> FloatArray:
-    """Return biases (K, p) of innovations for ``biases`` of readings: z = b - H e, e <- F (e + K
-    z).
-    """
+    """Return biases (K, p) of innovations z = b - H e, e <- F (e + K z), b those of readings."""
     found, e = [], np.zeros(len(alone.F))
     for bias in biases:
         found.append(bias - alone.H @ e)

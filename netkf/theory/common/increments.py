@@ -45,9 +45,7 @@ class IncrementFlows(NamedTuple):
         return min(flow.unit for flow, _ in self.groups)
 
     def without(self, silent: Collection[int]) -> IncrementFlows | None:
-        """Return the flows of all estimators but those that are ``silent`` (indices), None if all
-        are.
-        """
+        """Return the flows of all but ``silent`` estimators (indices), None if all are."""
         kept = [(flow, members[~np.isin(members, list(silent))]) for flow, members in self.groups]
         groups = [(flow, members) for flow, members in kept if len(members)]
         reading = [h for _, members in groups for h in members.tolist()]

@@ -54,8 +54,7 @@ class SlotJumps:
     def _pairs(self) -> tuple[IntArray, IntArray]:
         """Pairs (P,) of directions that share a draw; each is also paired with itself."""
         assert self.directions is not None
-        same = self.directions.source[:, None] == self.directions.source
-        first, second = np.nonzero(same)
+        first, second = np.nonzero(self.directions.source[:, None] == self.directions.source)
         return first, second
 
     @cached_property
@@ -131,9 +130,7 @@ class ClockJumps:
     @cached_property
     def _chains(self) -> list[IntArray]:
         assert self.directions is not None
-        return [
-            np.unique(self.directions.source[tick_directions]) for _, tick_directions in self.ticks
-        ]
+        return [np.unique(self.directions.source[own]) for _, own in self.ticks]
 
     @cached_property
     def flows(self) -> FloatArray:
@@ -172,9 +169,7 @@ class ClockJumps:
     def _means(self) -> list[FloatArray]:
         """The mean change E[D] (S, M, M) of the errors at a tick of each clock."""
         assert self.directions is not None
-        return [
-            self.directions.mean(self.nodes, tick_directions) for _, tick_directions in self.ticks
-        ]
+        return [self.directions.mean(self.nodes, own) for _, own in self.ticks]
 
     def sampled(self, X: FloatArray) -> FloatArray:
         """Return the part (S, M, M) of ``inflow`` that samples add, for moments X (S, M, M)."""
@@ -233,9 +228,7 @@ class LyapunovInverse:
 
     def __call__(self, Y: FloatArray) -> FloatArray:
         """Return X (S, M, M) with ``B X + X B' + Y = 0`` for Y (S, M, M), matrix by matrix."""
-        return np.stack(
-            [self._solve(T, U, matrix) for (T, U), matrix in zip(self._forms, Y, strict=True)]
-        )
+        return np.stack([self._solve(T, U, M) for (T, U), M in zip(self._forms, Y, strict=True)])
 
     @staticmethod
     def _solve(T: FloatArray, U: FloatArray, Y: FloatArray) -> FloatArray:

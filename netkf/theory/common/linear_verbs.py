@@ -104,8 +104,7 @@ class LinearVerbs:
 
     def _lay_out(self, arrays: dict[str, np.ndarray], rows: dict[str, np.ndarray]) -> None:
         """Store these ``arrays``; ``rows`` are rows in the forms by name, by default none."""
-        sizes = [array.size for array in arrays.values()]
-        ends = np.cumsum(sizes).tolist()
+        ends = np.cumsum([array.size for array in arrays.values()]).tolist()
         self._begin = dict(zip(arrays, [0, *ends], strict=False))
         self._shapes = {name: array.shape for name, array in arrays.items()}
         self._row = np.full(ends[-1], -1, dtype=np.int64)

@@ -1,7 +1,6 @@
 """Readings of the nodes of a scenario as H, the assumed R and a square root of the true R.
 
-Increments, and samples in slots or at times. The H of random and recorded regressors is that of the
-run.
+Increments, and samples in slots or at times. The H of random regressors is that of the run.
 """
 
 from __future__ import annotations
@@ -69,11 +68,9 @@ def _noises(scenario: Scenario) -> list[tuple[FloatArray, FloatArray]]:
     ]
 
 
-def _noise(
-    path: Any, k: int, noise: tuple[FloatArray, FloatArray]
-) -> tuple[FloatArray, FloatArray]:
+def _noise(path: Any, k: int, laws: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Return the assumed R and the root of the true one (p, p) of reading ``k`` of a path."""
-    R, root = noise
+    R, root = laws
     own, true = covariance_of(path, k, R), covariance_of(path, k, root @ root.T)
     return (R, root) if own is R else (own, np.asarray(np.linalg.cholesky(true)))
 
@@ -161,25 +158,20 @@ def timed_observations(
     if not any(by_node.values()):
         return {}
     n, noises, times = scenario.plant.n, _noises(scenario), sample_times(scenario, streams)
-    fixed = [
-        Observation(sensor.H, *noise)
-        for sensor, noise in zip(scenario.sensors, noises, strict=True)
-    ]
+    fixed = [Observation(s.H, *noise) for s, noise in zip(scenario.sensors, noises, strict=True)]
     observations: dict[float, dict[int, list[Observation]]] = {}
     for estimator, nodes in enumerate(nodes_by_estimator(scenario)):
         for node in nodes:
-            for placed_sensor in by_node.get(node, ()):
-                sensor = scenario.sensors[placed_sensor.entry]
+            for placed in by_node.get(node, ()):
+                sensor = scenario.sensors[placed.entry]
                 # A varying H is drawn with the run's own streams, so that it is the one that the
                 # engine used.
-                path = (
-                    sample_path(scenario, streams, node, placed_sensor) if sensor.varying else None
-                )
-                for k, time in enumerate(times[node, placed_sensor.ordinal].tolist()):
-                    reading = fixed[placed_sensor.entry]
+                path = sample_path(scenario, streams, node, placed) if sensor.varying else None
+                for k, time in enumerate(times[node, placed.ordinal].tolist()):
+                    reading = fixed[placed.entry]
                     if path is not None:
                         H = path.reading(k, np.zeros(n))[1]
-                        reading = Observation(H, *_noise(path, k, noises[placed_sensor.entry]))
+                        reading = Observation(H, *_noise(path, k, noises[placed.entry]))
                     at_time = observations.setdefault(time, {}).setdefault(estimator, [])
                     at_time += [reading] * is_up(node, time)
     return {

@@ -281,9 +281,7 @@ def _deliveries(
 def poisson_ticks(
     scenario: Scenario, links: list[tuple[int, int]]
 ) -> tuple[tuple[float, IntArray], ...]:
-    """Return for each clock its rate (1/s) and the directions (K,) that transmit; TheoryError
-    unless Poisson.
-    """
+    """Return each clock's rate (1/s) and directions (K,); TheoryError unless Poisson."""
     clock = scenario.network.activation
     assert isinstance(clock, LinkClock)
     if clock.at == "readings" or not clock.memoryless:
@@ -293,13 +291,11 @@ def poisson_ticks(
     ticks = []
     for entity in entities:
         if clock.at == "nodes":
-            tick_directions = [k for link, k in index.items() if link[0] == entity[0]]
+            own = [k for link, k in index.items() if link[0] == entity[0]]
         else:
             ends = (entity[0], entity[1])
             directions = (ends, ends[::-1]) if clock.at == "links" else (ends,)
-            tick_directions = [index[link] for link in directions if link in index]
-        if tick_directions:
-            ticks.append(
-                (float(clock.mean_rate(entity)), np.array(tick_directions, dtype=np.int64))
-            )
+            own = [index[link] for link in directions if link in index]
+        if own:
+            ticks.append((float(clock.mean_rate(entity)), np.array(own, dtype=np.int64)))
     return tuple(ticks)

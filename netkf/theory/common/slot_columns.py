@@ -219,9 +219,7 @@ class SlotColumns(ErrorColumns):
             rows = (matrix[:, NOISE:] != matrix[:, ZERO : ZERO + 1]).any(axis=1)
             if rows.any():
                 linear[name] = matrix, rows
-        parts = [
-            matrix[rows, NOISE:] - matrix[rows, ZERO : ZERO + 1] for matrix, rows in linear.values()
-        ]
+        parts = [M[rows, NOISE:] - M[rows, ZERO : ZERO + 1] for M, rows in linear.values()]
         # Columns that came after a time are zero there.
         kept = [padded(form, columns - 1 - form.shape[1], 1) for form in self._kept]
         forms = [self._x, *kept]
@@ -231,10 +229,7 @@ class SlotColumns(ErrorColumns):
             stack = cast(FloatArray, np.linalg.qr(stack.T, mode="r")).T
         count = NOISE + stack.shape[1]
         pieces = np.split(stack, np.cumsum([len(form) for form in (*forms, *parts)])[:-1])
-        forms = [
-            np.column_stack([form[:, :NOISE], piece])
-            for form, piece in zip(forms, pieces, strict=False)
-        ]
+        forms = [np.column_stack([f[:, :NOISE], p]) for f, p in zip(forms, pieces, strict=False)]
         self._x, self._kept = forms[0], [form[:, MEAN:] for form in forms[1:]]
         values = {}
         for (name, (matrix, rows)), part in zip(linear.items(), pieces[len(forms) :], strict=True):
@@ -246,13 +241,11 @@ class SlotColumns(ErrorColumns):
 
     def _forms(self) -> FloatArray:
         """Return the errors (M n, C - 1): the means, and the columns of noises."""
-        estimates = self._matrix("xhat")
-        return np.asarray(self._x[self._setup.entries.ravel()] - estimates)[:, MEAN:]
+        return np.asarray(self._x[self._setup.entries.ravel()] - self._matrix("xhat"))[:, MEAN:]
 
     def covariances(self) -> FloatArray:
         """Return P (M, n, n) of the estimators."""
-        roots = self._matrix("root")[:, ZERO]
-        S = np.tril(roots.reshape(self.estimators, self.n, self.n))
+        S = np.tril(self._matrix("root")[:, ZERO].reshape(self.estimators, self.n, self.n))
         return np.asarray(S @ np.swapaxes(S, 1, 2))
 
     def _matrix(self, name: str) -> FloatArray:

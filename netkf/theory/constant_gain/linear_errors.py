@@ -117,8 +117,7 @@ def _sampled_nodes(scenario: Scenario) -> list[SampledNode]:
         for placed_sensor in scenario.sampled_sensors.get(node, ()):
             sensor, L = scenario.sensors[placed_sensor.entry], gains[k]
             clock, entity = sampling_clock(sensor), (node, placed_sensor.ordinal)
-            noise = L @ sensor.R @ L.T
-            sampled_nodes.append(SampledNode(k, clock, entity, L @ sensor.H, noise))
+            sampled_nodes.append(SampledNode(k, clock, entity, L @ sensor.H, L @ sensor.R @ L.T))
     return sampled_nodes
 
 

@@ -116,10 +116,8 @@ def _make_sources(scenario: Scenario) -> list[_Source]:
                 sources.append(_Source(node, sensor.A, sensor.C, sensor.start, drive))
             elif isinstance(sensor, LinearSensor):
                 # A fixed row H is a regressor with the constant state 1 and no noise.
-                fixed_state = (np.ones(1), np.zeros((0, 0)))
-                sources += [
-                    _Source(node, np.eye(1), row[:, None], *fixed_state) for row in sensor.H
-                ]
+                fixed = (np.ones(1), np.zeros((0, 0)))
+                sources += [_Source(node, np.eye(1), row[:, None], *fixed) for row in sensor.H]
             else:
                 raise TheoryError(f"the sensor of node {node} is a record, which has no law")
     if not sources:

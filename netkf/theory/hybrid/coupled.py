@@ -201,8 +201,7 @@ def require_bound(scenario: Scenario) -> None:
 
 def increment_informations(scenario: Scenario) -> FloatArray:
     """Return ``H_i' R_i^-1 H_i`` (N, n, n) of increments; a pooled filter has all of them."""
-    observations = increment_observations(scenario)
-    informations = [o.H.T @ np.linalg.solve(o.R, o.H) for o in observations]
+    informations = [o.H.T @ np.linalg.solve(o.R, o.H) for o in increment_observations(scenario)]
     if scenario.filter.algorithm.timing.pooled:
         informations = informations * len(scenario.nodes)
     return np.stack(informations)

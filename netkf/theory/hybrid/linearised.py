@@ -63,8 +63,7 @@ def is_stable(linear: LinearisedRiccati) -> bool:
     packed = linear.packed
     P = packed.equations.start
     right = packed.pack(np.broadcast_to(np.eye(P.shape[-1]), P.shape))
-    tolerance = 0.1 / float(np.linalg.norm(right))
-    X = packed.unpack(solve_map(linear, right, tolerance))
+    X = packed.unpack(solve_map(linear, right, 0.1 / float(np.linalg.norm(right))))
     if not np.isfinite(X).all():
         return False
     values = np.linalg.eigvalsh(X)

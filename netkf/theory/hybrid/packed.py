@@ -1,8 +1,7 @@
 """H(12) with symmetric matrices stored as upper triangles, rows of m = n (n + 1) / 2 numbers.
 
 The terms then have their natural cost: one sparse product over neighbours for all entries at once,
-one small matrix for A P + P A' that is the same at all nodes, and P G P only at nodes with a
-sensor.
+one small matrix for A P + P A', the same at all nodes, and P G P only at nodes with a sensor.
 """
 
 from __future__ import annotations

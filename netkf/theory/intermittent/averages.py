@@ -78,12 +78,9 @@ def path_average(
 
 
 def _evaluate(
-    function: Callable[[FloatArray], ArrayLike],
-    system: SlotSystem,
-    root: FloatArray,
-    arrived: np.ndarray,
+    f: Callable[[FloatArray], ArrayLike], system: SlotSystem, root: FloatArray, arrived: np.ndarray
 ) -> list[FloatArray]:
-    """Return values of ``function`` at P_0, P_1, ..., in pieces (K,) of limited size."""
+    """Return values of ``f`` at P_0, P_1, ..., in pieces (K,) of limited size."""
     F, Q, H, R = system
     modes, root_Q = reading_modes([(H[:0], R[:0, :0]), (H, R)], len(F)), square_root(Q)
     piece, values_of_pieces = max(1, MAX_ENTRIES // len(F) ** 2), []
@@ -93,7 +90,7 @@ def _evaluate(
         # R (140) averages over P_0 .. P_{t-1}: each covariance before its own slot.
         roots_before = np.concatenate([root[None], roots[:-1]])
         P, root = roots_before @ np.swapaxes(roots_before, 1, 2), roots[-1]
-        values = np.asarray(function(P), dtype=np.float64)
+        values = np.asarray(f(P), dtype=np.float64)
         if values.shape != (len(P),):
             raise TheoryError(
                 f"the function must give one number per covariance, not {values.shape}"

@@ -208,8 +208,7 @@ def critical_certificate(F: ArrayLike, H: ArrayLike) -> CriticalProbability:
     that no gain does at g - 1e-6. Raises TheoryError if (F, H) is not detectable.
     """
     transition = as_square("F", F)
-    n = len(transition)
-    observation = _check_observation(H, n)
+    observation = _check_observation(H, len(transition))
     hidden = undetectable_slot_mode(transition, observation)
     if hidden is not None:
         raise TheoryError(
@@ -432,8 +431,7 @@ def couple_from_the_past(
     """Return K exact draws (K, n, n) from the invariant law of a switched Riccati recursion, and
     their last modes (K,) (Propp and Wilson 1996). ``draw(following, T)`` returns T modes before
     ``following`` (K, S), ``propagate(roots, modes)`` applies modes (K, T); ``empty`` (K, 0) fixes K
-    and type. Chains from both ``starts`` (2, n, n) run until they meet; TheoryError after MAX_PAST
-    slots.
+    and type. Chains from both ``starts`` (2, n, n) run until they meet, for MAX_PAST slots.
     """
     out = np.empty((len(empty), *starts.shape[1:]))
     last = np.empty(len(empty), dtype=empty.dtype)

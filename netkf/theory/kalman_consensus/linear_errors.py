@@ -46,8 +46,7 @@ def consensus_jumps(scenario: Scenario) -> SlotJumps:
         # Gains are steady: each node runs the Riccati equation of the readings that it uses.
         P = steady_covariance(F, Q, H, R)
         K = np.linalg.solve(H @ P @ H.T + R, H @ P).T if len(H) else np.zeros((len(F), 0))
-        columns = [np.arange(rows[j], rows[j + 1]) for j in senders]
-        gains[k][:, np.concatenate(columns)] = K
+        gains[k][:, np.concatenate([np.arange(rows[j], rows[j + 1]) for j in senders])] = K
         closed.append(np.eye(len(F)) - K @ H)
         # The consensus term is gamma P times the differences of predictions.
         terms.append(algorithm.epsilon / (1.0 + np.linalg.norm(P)) * P)

@@ -5,8 +5,7 @@ A map T maps stacks (S, M, M) of symmetric matrices, such as second moments in e
 such stacks. Its spectral radius is its rightmost eigenvalue, with a semidefinite eigenvector X
 (Krein and Rutman). Arnoldi's method computes it, and if X is positive definite, X proves it as an
 upper bound (Collatz and Wielandt). If X is singular, small maps are solved by dense eigenvalues.
-The radius is below 1 if and only if ``X = T(X) + Q`` has a semidefinite solution for a positive
-definite Q.
+The radius is below 1 if and only if ``X = T(X) + Q`` has a semidefinite solution for a Q > 0.
 """
 
 from __future__ import annotations

@@ -25,23 +25,20 @@ HEAVY_TAIL_RADIUS = 0.885  # above it mean squares over runs have no useful inte
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return the assumptions of the push-sum paper as rows of the table."""
-    return [
-        *_plant_rows(scenario),
-        *_link_rows(scenario),
-        *_gain_rows(scenario),
-        _stop_row(scenario),
-        *_moment_rows(scenario),
-    ]
-
-
-def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
     (F, Q), source = scenario.slot_belief, "P Assumption 2"
     driven = judge_driven(F, Q, "; P_inf needs only those that do not decay")
     rows: list[AssumptionRow] = [("(F, Q^1/2) is controllable", source, *driven)]
     if not any(sensor.varying for sensor in scenario.sensors):
         seen = judge_observed(scenario, F, "; a mode that decays does no harm")
         rows.append(("(F, H) is observable, all sensors together", source, *seen))
-    return [*rows, true_model_row(scenario, "P (7), (8)", "same F, Q and R")]
+    return [
+        *rows,
+        true_model_row(scenario, "P (7), (8)", "same F, Q and R"),
+        *_link_rows(scenario),
+        *_gain_rows(scenario),
+        _stop_row(scenario),
+        *_moment_rows(scenario),
+    ]
 
 
 def _link_rows(scenario: Scenario) -> list[AssumptionRow]:

@@ -60,12 +60,10 @@ class EstimationSteps:
         """Covariance (N n, N n) of h, the noise of a slot before averaging."""
         N, n, _ = self.closed.shape
         # The plant's noise is common to all nodes, the sensors' noises are independent.
-        covariance = np.einsum(
-            "iab,bc,jdc->iajd", self.process, self.Q, self.process, optimize=True
-        )
+        cov = np.einsum("iab,bc,jdc->iajd", self.process, self.Q, self.process, optimize=True)
         nodes = np.arange(N)
-        covariance[nodes, :, nodes] += self.sensor_noise
-        return symmetric(covariance.reshape(N * n, N * n))
+        cov[nodes, :, nodes] += self.sensor_noise
+        return symmetric(cov.reshape(N * n, N * n))
 
 
 def estimation_steps(scenario: Scenario, averaging: Averaging | None = None) -> EstimationSteps:

@@ -207,14 +207,12 @@ def large_gamma_limits(scenario: Scenario) -> LargeGamma:
     noise = np.zeros((N * n, N * n))
     noise[:n, :n] = symmetric(block)
     # X = A_C X A_C' + noise, with A_C the mean closed loop.
-    central = steps.closed.mean(axis=0)
-    X = scipy.linalg.solve_discrete_lyapunov(central, block / N)
+    X = scipy.linalg.solve_discrete_lyapunov(steps.closed.mean(axis=0), block / N)
     return LargeGamma(noise, symmetric(np.asarray(X)))
 
 
 def push_sum_noise(scenario: Scenario, gammas: Sequence[int]) -> FloatArray:
-    """Return the covariance (len(gammas), N n, N n) of the transformed noise of paper P (29),
-    exactly.
+    """Return the exact covariance (len(gammas), N n, N n) of the noise of paper P (29).
 
     ``(T' (x) I) E[(M (x) I) cov(h) (M (x) I)'] (T (x) I)``, where (x) is the Kronecker product, M
     (N, N) the random product of gamma averaging steps, h (N n,) the stacked noises of the plant and
@@ -226,8 +224,7 @@ def push_sum_noise(scenario: Scenario, gammas: Sequence[int]) -> FloatArray:
     _require_averaging(scenario, steps)
     N, n, _ = steps.closed.shape
     # The orthogonal factor of (v, e_1, ..): its first column is v up to a sign.
-    first = np.column_stack([np.ones(N), np.eye(N)[:, : N - 1]])
-    T = np.linalg.qr(first)[0]
+    T = np.linalg.qr(np.column_stack([np.ones(N), np.eye(N)[:, : N - 1]]))[0]
     transform = np.kron(T * np.sign(T[0, 0]), np.eye(n))
     covariances = []
     for gamma in as_list("gammas", gammas):

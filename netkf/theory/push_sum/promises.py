@@ -63,8 +63,7 @@ def _exact_gamma(scenario: Scenario) -> int:
 
 def _leader_slots(scenario: Scenario) -> int:
     """Return the slots until all know the leader with probability AGREEMENT; TheoryError."""
-    probabilities = leader_agreement(scenario, MAX_LEADER_SLOTS)
-    undecided = probabilities < AGREEMENT
+    undecided = leader_agreement(scenario, MAX_LEADER_SLOTS) < AGREEMENT
     if undecided.all():
         raise TheoryError(f"not within {MAX_LEADER_SLOTS} slots")
     return int(undecided.sum())

@@ -71,11 +71,9 @@ def steady_tracks(scenario: Scenario) -> tuple[FloatArray | None, float]:
 def _mean_reported_covariance(scenario: Scenario, joint: FloatArray, i: int) -> FloatArray:
     """Return the mean covariance (n, n) of what node i reports; raises TheoryError."""
     node, topology = scenario.nodes[i], scenario.topology
-    probabilities = {
-        topology.index[j]: arrival_of(scenario, (j, node)) for j in topology.senders(node)
-    }
-    certain = [j for j, p in probabilities.items() if p == 1.0]
-    unsure = [j for j, p in probabilities.items() if 0.0 < p < 1.0]
+    arrivals = {topology.index[j]: arrival_of(scenario, (j, node)) for j in topology.senders(node)}
+    certain = [j for j, p in arrivals.items() if p == 1.0]
+    unsure = [j for j, p in arrivals.items() if 0.0 < p < 1.0]
     if len(unsure) > MAX_NEIGHBOURS:
         raise TheoryError(
             f"node {node} hears {len(unsure)} nodes with losses; at most "
@@ -85,9 +83,7 @@ def _mean_reported_covariance(scenario: Scenario, joint: FloatArray, i: int) -> 
     # E[P] over who is heard: best combinations are no linear function of the outcomes.
     for heard in itertools.product((True, False), repeat=len(unsure)):
         outcomes = list(zip(unsure, heard, strict=True))
-        probability = math.prod(
-            probabilities[j] if is_heard else 1.0 - probabilities[j] for j, is_heard in outcomes
-        )
+        probability = math.prod(arrivals[j] if up else 1.0 - arrivals[j] for j, up in outcomes)
         order = [i, *certain, *(j for j, is_heard in outcomes if is_heard)]
         own: FloatArray = joint[i, i]
         if len(order) > 1:
