@@ -420,16 +420,10 @@ class BeliefPropagation(Filter):
 
     analysis = Analysis(paper="belief_propagation")
     kernels = Kernels(
-        predict=predict,
-        update=update,
-        emit=emit,
-        absorb=absorb,
-        shift=shift,
-        shift_payload=shift_payload,
-        addressed=True,
-        record=belief_propagation_record,
+        predict=predict, update=update, emit=emit, absorb=absorb, shift=shift,
+        shift_payload=shift_payload, addressed=True, record=belief_propagation_record,
         begin=begin_belief_propagation,
-    )
+    )  # fmt: skip
 
     def _keeps(self, model: Any) -> bool:
         """Return whether messages are kept from slot to slot, or under clocks."""

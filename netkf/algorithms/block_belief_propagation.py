@@ -137,13 +137,9 @@ class BlockBeliefPropagation(Filter):
     def needs(self) -> Needs:
         """Its demands on a scenario."""
         return Needs(
-            one_way=True,
-            samples=True,
-            blocks=True,
-            own_blocks=True,
-            check=self._check_memory,
+            one_way=True, samples=True, blocks=True, own_blocks=True, check=self._check_memory,
             notes=note_loops,
-        )
+        )  # fmt: skip
 
     def _check_memory(self, scenario: Any) -> None:
         """Raise ScenarioError where paths of a ``netkf.Scenario`` would not fit into memory."""

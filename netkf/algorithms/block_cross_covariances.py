@@ -560,19 +560,10 @@ class BlockCrossCovariances(Filter):
         payload_numbers=lambda n, *_: n + n * (n + 1) // 2 + 4 * n * n,
     )
     kernels = Kernels(
-        pair_record,
-        begin_pair,
-        predict=predict,
-        update=update,
-        emit=emit,
-        absorb=absorb,
-        shift=shift,
-        means=("xhat", "told"),
-        sends_readings=True,
-        decides=True,
-        depends_on_data=False,
-        addressed=True,
-    )
+        pair_record, begin_pair, predict=predict, update=update, emit=emit, absorb=absorb,
+        shift=shift, means=("xhat", "told"), sends_readings=True, decides=True,
+        depends_on_data=False, addressed=True,
+    )  # fmt: skip
 
     @property
     def timing(self) -> Timing:

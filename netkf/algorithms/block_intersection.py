@@ -363,14 +363,8 @@ class BlockIntersection(Filter):
         return Analysis(P_by_design=design, affine=True)
 
     kernels = Kernels(
-        block_record,
-        begin_block,
-        predict=predict,
-        update=update,
-        emit=emit,
-        absorb=absorb,
-        sends_readings=True,
-        counts_sends=True,
-    )
+        block_record, begin_block, predict=predict, update=update, emit=emit, absorb=absorb,
+        sends_readings=True, counts_sends=True,
+    )  # fmt: skip
 
     shift = Filter.shift  # affine in readings and messages

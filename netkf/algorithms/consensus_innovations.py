@@ -404,15 +404,9 @@ class ConsensusInnovations(Filter):
     def needs(self) -> Needs:
         """Its demands on a scenario."""
         return Needs(
-            one_way=True,
-            fixed_sensors=True,
-            linear_plant=True,
-            every_reading=True,
-            awake=True,
-            common_start=True,
-            network=True,
-            notes=self._scenario_notes,
-        )
+            one_way=True, fixed_sensors=True, linear_plant=True, every_reading=True, awake=True,
+            common_start=True, network=True, notes=self._scenario_notes,
+        )  # fmt: skip
 
     def _scenario_notes(self, scenario: Any) -> tuple[str, ...]:
         """Return a note where messages may be lost or held back, which makes P too small."""

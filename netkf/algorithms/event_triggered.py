@@ -191,12 +191,8 @@ class EventTriggeredCi(Filter):
         ),
     )
     kernels = Kernels(
-        predict=predict,
-        emit=emit,
-        absorb=absorb,
-        shift=shift,
-        decides=True,
+        predict=predict, emit=emit, absorb=absorb, shift=shift, decides=True,
         record=event_triggered_ci_record,
-    )
+    )  # fmt: skip
 
     shift = Filter.shift  # affine, given who sends

@@ -243,15 +243,9 @@ def forget_events(record: Any, h: int, run: Any) -> None:
 
 
 UNDER_CLOCKS = Kernels(
-    predict=predict,
-    update=update,
-    emit=send_origin,
-    absorb=absorb,
-    shift=shift,
-    shift_payload=keep_payload,
-    sends_readings=True,
-    remembers=True,
-)
+    predict=predict, update=update, emit=send_origin, absorb=absorb, shift=shift,
+    shift_payload=keep_payload, sends_readings=True, remembers=True,
+)  # fmt: skip
 
 
 def reading_size(n: int, rows: int, _: int) -> int:
@@ -306,14 +300,10 @@ class Intermittent(Filter):
     )
     needs = Needs(one_way=True, samples=True)
     kernels = Kernels(
-        emit=emit_nothing,
-        absorb=use_readings_heard,
-        shift_payload=keep_payload,
-        sends_readings=True,
-        under_clocks=UNDER_CLOCKS,
-        record=intermittent_record,
+        emit=emit_nothing, absorb=use_readings_heard, shift_payload=keep_payload,
+        sends_readings=True, under_clocks=UNDER_CLOCKS, record=intermittent_record,
         begin=begin_intermittent,
-    )
+    )  # fmt: skip
 
     @property
     def timing(self) -> Timing:

@@ -611,21 +611,12 @@ class Partition(Filter):
     """
 
     needs = Needs(
-        one_way=True,
-        samples=True,
-        blocks=True,
-        coupled=True,
-        linear_plant=True,
+        one_way=True, samples=True, blocks=True, coupled=True, linear_plant=True,
         check=refuse_points_of_pairs,
-    )
+    )  # fmt: skip
     analysis = Analysis(P_by_design=("larger", "larger"), affine=True)
     kernels = Kernels(
-        partition_record,
-        begin_partition,
-        predict=predict,
-        update=update,
-        absorb=absorb,
-        shift=shift,
-        means=("xhat", "x", "start_x"),
-    )
+        partition_record, begin_partition, predict=predict, update=update, absorb=absorb,
+        shift=shift, means=("xhat", "x", "start_x"),
+    )  # fmt: skip
     shift = Filter.shift  # affine in readings and messages

@@ -492,15 +492,9 @@ def begin_push_sum(
 
 
 SLOTS = Kernels(
-    record=push_sum_record,
-    begin=begin_push_sum,
-    predict=predict,
-    update=update,
-    emit=emit,
-    absorb=absorb,
-    observe=observe,
-    under_clocks=running_sums.KERNELS,
-)
+    record=push_sum_record, begin=begin_push_sum, predict=predict, update=update, emit=emit,
+    absorb=absorb, observe=observe, under_clocks=running_sums.KERNELS,
+)  # fmt: skip
 LIMIT = "whose asymptotic gains are the limit of one plant, and wrong until the next has its own"
 PARTS = (
     "whose totals keep information under way in parts by the rates at which modes decay: those of "

@@ -397,13 +397,6 @@ def observe(record: Any, h: int, run: Any) -> None:
 
 
 KERNELS = Kernels(
-    predict=predict,
-    update=update,
-    emit=emit,
-    absorb=absorb,
-    shift=shift,
-    shift_payload=shift_payload,
-    observe=observe,
-    counts_sends=True,
-    unrolled=True,
-)
+    predict=predict, update=update, emit=emit, absorb=absorb, shift=shift,
+    shift_payload=shift_payload, observe=observe, counts_sends=True, unrolled=True,
+)  # fmt: skip

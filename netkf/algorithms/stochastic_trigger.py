@@ -348,15 +348,9 @@ def with_trigger(inner: Kernels) -> Kernels:
                 run.sends[q] = 0
 
     return replace(
-        inner,
-        record=triggered_record,
-        begin=begin_triggered,
-        prepare=prepare_triggered,
-        update=update,
-        emit=emit,
-        decides=True,
-        under_clocks=None,
-    )
+        inner, record=triggered_record, begin=begin_triggered, prepare=prepare_triggered,
+        update=update, emit=emit, decides=True, under_clocks=None,
+    )  # fmt: skip
 
 
 @forwarding

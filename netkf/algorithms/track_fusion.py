@@ -333,26 +333,15 @@ class BarShalomCampo(Filter):
     )
     timing = Timing(clocks=())
     needs = Needs(
-        one_way=True,
-        fixed_sensors=True,
-        linear_plant=True,
-        every_reading=True,
-        awake=True,
-        common_start=True,
-        memory="whose cross-covariances are those of tracks that began together",
+        one_way=True, fixed_sensors=True, linear_plant=True, every_reading=True, awake=True,
+        common_start=True, memory="whose cross-covariances are those of tracks that began together",
         network=True,
-    )
+    )  # fmt: skip
     kernels = Kernels(
-        predict=predict_track,
-        update=update_track,
-        emit=emit_track,
-        absorb=combine_heard,
-        shift=shift_tracks,
-        slotwise=True,
-        record=bar_shalom_campo_record,
-        begin=begin_bar_shalom_campo,
-        prepare=prepare_bar_shalom_campo,
-    )
+        predict=predict_track, update=update_track, emit=emit_track, absorb=combine_heard,
+        shift=shift_tracks, slotwise=True, record=bar_shalom_campo_record,
+        begin=begin_bar_shalom_campo, prepare=prepare_bar_shalom_campo,
+    )  # fmt: skip
 
     shift = Filter.shift  # affine: tracks enter by their differences
 

@@ -250,20 +250,12 @@ def _none_diverged(results: list[ReplicaResult], level: float) -> Finding:
 
 SAME_AS_BASE = Promise(
     "its estimates are those of the filter that it derives from, on the same readings",
-    "the class itself",
-    (),
-    _same_as_base,
-    exact=True,
-    group=BASE,
-)
+    "the class itself", (), _same_as_base, exact=True, group=BASE,
+)  # fmt: skip
 NONE_DIVERGED = Promise(
-    "estimates are finite and covariances positive semidefinite",
-    "the class itself",
-    (),
-    _none_diverged,
-    exact=True,
-    group=BASE,
-)
+    "estimates are finite and covariances positive semidefinite", "the class itself", (),
+    _none_diverged, exact=True, group=BASE,
+)  # fmt: skip
 
 
 def judge_replicas(

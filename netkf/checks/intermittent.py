@@ -446,13 +446,9 @@ SCALAR = (
 
 
 DIVERGES = Promise(
-    "E[P] grows without bound, below the critical probability",
-    "R (29), (31)",
-    FRESH,
-    _mean_diverges,
-    exact=True,
-    group=COMPUTED,
-)
+    "E[P] grows without bound, below the critical probability", "R (29), (31)", FRESH,
+    _mean_diverges, exact=True, group=COMPUTED,
+)  # fmt: skip
 
 
 def _assumptions(scenario: Scenario) -> list[Assumption]:

@@ -104,14 +104,9 @@ def pool(
     margin = -pooled.value, -pooled.high, -pooled.low
     text = f"{what}; one by one: {single.message}: {max(0.0, -single.margin[0]):.3g}"
     return single._replace(
-        margin=margin,
-        tolerance=tolerance,
-        message=text,
-        seen=pooled.seen,
-        expected=pooled.expected,
-        detectable=pooled.detectable,
-        forecast=pooled.expected_high,
-    )
+        margin=margin, tolerance=tolerance, message=text, seen=pooled.seen,
+        expected=pooled.expected, detectable=pooled.detectable, forecast=pooled.expected_high,
+    )  # fmt: skip
 
 
 def compare_laws(pairs: Sequence[Pair], level: float, start: float = 0.0) -> Finding:

@@ -265,13 +265,9 @@ LIMIT = Promise(
     group=COMPUTED,
 )
 CERTIFIED = Promise(
-    "the gamma that Theorem 6 certifies keeps mean squares bounded",
-    "P Theorem 6",
-    ("P Assumption 3",),
-    _gamma_certified,
-    exact=True,
-    group=COMPUTED,
-)
+    "the gamma that Theorem 6 certifies keeps mean squares bounded", "P Theorem 6",
+    ("P Assumption 3",), _gamma_certified, exact=True, group=COMPUTED,
+)  # fmt: skip
 
 
 def _assumptions(scenario: Scenario) -> list[Assumption]:

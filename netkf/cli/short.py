@@ -88,15 +88,9 @@ def run_import(options: argparse.Namespace) -> int:
     from netkf.logs.importing import import_log
 
     files, notes = import_log(
-        options.log,
-        options.kind,
-        options.out,
-        like=options.like,
-        unreported=options.unreported,
-        hole=options.hole,
-        trust=options.trust,
-        columns=options.columns,
-    )
+        options.log, options.kind, options.out, like=options.like, unreported=options.unreported,
+        hole=options.hole, trust=options.trust, columns=options.columns,
+    )  # fmt: skip
     print(f"written: {files[0]} with {', '.join(path.name for path in files[1:])}")
     for note in notes:
         print(note if ": " in note[:14] else f"note: {note}")

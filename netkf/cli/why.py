@@ -28,15 +28,9 @@ def _explain(options: argparse.Namespace) -> int:
         run, node, at, note = _find_worst_sample(options)
         notes.append(note)
     explanation = why(
-        run,
-        node,
-        at,
-        replica=options.replica,
-        below=options.below,
-        most=options.most,
-        replays=options.replays,
-        trust=options.trust,
-    )
+        run, node, at, replica=options.replica, below=options.below, most=options.most,
+        replays=options.replays, trust=options.trust,
+    )  # fmt: skip
     # Not before: a refusal is one line.
     print_notes(notes)
     try:

@@ -33,17 +33,9 @@ ROOT = Path(__file__).parents[1]
 """The folder of netkf."""
 
 ROOMS = (
-    "linalg",
-    "rng",
-    "core",
-    "network",
-    "algorithms",
-    "plants",
-    "trace",
-    "engines",
-    "ensembles",
+    "linalg", "rng", "core", "network", "algorithms", "plants", "trace", "engines", "ensembles",
     "theory/numerics",
-)
+)  # fmt: skip
 """Folders of netkf whose functions and constants can become part of compiled code."""
 
 MAX_CACHED_STATES = 4

@@ -7,26 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 KINDS = (
-    "sense",
-    "tick",
-    "send",
-    "deliver",
-    "lost",
-    "late",
-    "absorb",
-    "swap",
-    "round",
-    "stop",
-    "crash",
-    "restart",
-    "diverged",
-    "transmit",
-    "link",
-    "join",
-    "leave",
-    "refuse",
-    "clip",
-)
+    "sense", "tick", "send", "deliver", "lost", "late", "absorb", "swap", "round", "stop", "crash",
+    "restart", "diverged", "transmit", "link", "join", "leave", "refuse", "clip",
+)  # fmt: skip
 """Event kinds; a row stores the index of its kind in this tuple.
 
 sense    node took the reading that ends at t

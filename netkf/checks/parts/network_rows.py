@@ -71,13 +71,9 @@ NETWORK = JudgedClocks(
     events.network_clocks, "ticks", events.redraw_ticks, evidence.CLOCKS, "clocks tick", "ticks"
 )
 SENSORS = JudgedClocks(
-    events.sampling_clocks,
-    "sampling",
-    events.redraw_samples,
-    evidence.SAMPLING,
-    "sensors sample",
+    events.sampling_clocks, "sampling", events.redraw_samples, evidence.SAMPLING, "sensors sample",
     "samples",
-)
+)  # fmt: skip
 CONTACT_SENTENCE = "links tick in their contacts only"
 
 

@@ -76,15 +76,8 @@ MAX_FILTERS = 200
 """Filters that are simulated together at most, unless one run has more."""
 
 _POSITIONS = (
-    "tick_at",
-    "ticks_stop",
-    "first_delay",
-    "piece",
-    "grid_at",
-    "wake_at",
-    "probe_at",
-    "samples",
-)
+    "tick_at", "ticks_stop", "first_delay", "piece", "grid_at", "wake_at", "probe_at", "samples",
+)  # fmt: skip
 PROGRESS = np.dtype([(name, np.int64) for name in _POSITIONS])
 """The position of a run that is interrupted, see Simulation."""
 

@@ -401,14 +401,9 @@ class SlotRuns:
         if timed:
             start = np.array([plant.slot_time(slot) for slot in slots.tolist()])
         return SlotTimes(
-            first=self._slot,
-            start=start,
-            recorded=recorded,
-            sensed=sensed,
-            exchanged=exchanged,
-            sample=sample,
-            predicts=algorithm.timing.predicts,
-        )
+            first=self._slot, start=start, recorded=recorded, sensed=sensed, exchanged=exchanged,
+            sample=sample, predicts=algorithm.timing.predicts,
+        )  # fmt: skip
 
     def _draw_messages(self, times: SlotTimes) -> SlotMessages:
         setup = self.setup
