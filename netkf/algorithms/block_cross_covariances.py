@@ -539,8 +539,7 @@ class BlockCrossCovariances(Filter):
     approximated as if the readings of a pair had been own ones, and nothing is proved of P: the
     more pairs have nodes in common the more overconfident it is, most where they exchange at once,
     as pairs of one step do, and under clocks all of one instant. Both nodes are updated if both
-    transmit at the instant of the readings; one that hears nothing then is not. A message that took
-    time is used for nothing.
+    transmit at the instant of the readings. A message that took time is used for nothing.
     """
 
     steps: int = field(integer(low=1, high=MAX_STEPS), default=8)

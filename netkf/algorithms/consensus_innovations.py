@@ -80,8 +80,7 @@ class GainSequence:
 
     The errors ``x - xhat_i`` of all N nodes, then ``y - yhat_i``, are linear in independent inputs
     of variance 1 (x(0), plant noise, sensor noise): ``_errors`` (2 N n, inputs) holds the
-    coefficients, so that covariances are products of its rows, and differences of nearly equal
-    estimates lose no digits.
+    coefficients: covariances are products of its rows, and differences lose no digits.
     """
 
     def __init__(

@@ -40,8 +40,7 @@ class Model(Protocol):
         self, xhat: FloatArray, root: FloatArray, gap: float
     ) -> tuple[FloatArray, FloatArray]:
         """Return estimate (n,) and root (n, n) of its covariance ``gap`` seconds later, from
-        ``xhat`` (n,) and ``root`` (n, n) now. With increment sensors the root counts the readings
-        of the gap already.
+        ``xhat`` (n,) and ``root`` (n, n) now; the root counts readings of the gap already.
         """
 
     def extrapolate(
@@ -359,8 +358,7 @@ class Filter(Component):
         return state.xhat, state.root @ state.root.T
 
     def shift(self, state: Any, offset: FloatArray) -> Any:
-        """Return a state, or a payload under way, with ``offset`` (n,) added to the estimate and to
-        everything like one.
+        """Return a state, or a payload under way, with ``offset`` (n,) added to the estimate.
 
         Engines call it when they move the origin of coordinates near to the true state, so that
         errors on unstable plants keep their digits; of a payload ``offset`` is the move at the time

@@ -3,8 +3,7 @@ a node uses the readings that arrive, its own and its neighbours'.
 
 In slots the state is a prediction: after the readings of a slot it is predicted to the next one.
 Under clocks a message takes time, and its reading may be late. It is used exactly, as if it had
-come in time: the node remembers its past events, goes back to before the reading, and repeats all
-that came after it.
+come in time: the node goes back to before the reading, and repeats all that came after it.
 
 The origin of coordinates moves now and then to near the true state, so that large states cost no
 digits (``shift``, ``rebase``). A move is an event of the past too.

@@ -86,8 +86,7 @@ class FlowModel:
         self, xhat: FloatArray, root: FloatArray, gap: float
     ) -> tuple[FloatArray, FloatArray]:
         """Return the estimate (n,) and the root (n, n) of its covariance ``gap`` seconds after
-        ``xhat`` (n,) and ``root`` (n, n); the root counts the increments of the gap, the estimate
-        not yet (``gain_update``).
+        ``xhat`` (n,) and ``root`` (n, n); the root counts the increments, the estimate not yet.
         """
         root, xhat = flow_root(self.flow, lower(root), as_floats(xhat), gap)
         return xhat, root
@@ -183,8 +182,7 @@ class SlotModel:
 
     def max_interval(self, root: FloatArray) -> float:
         """Return the longest measurement interval in seconds: infinity, whatever the ``root``
-        (n, n), since slots have no increments that an interval would limit; see
-        ``Timing.interval``.
+        (n, n): slots have no increments that an interval would limit.
         """
         return math.inf
 

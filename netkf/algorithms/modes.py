@@ -34,8 +34,7 @@ SAME_RATE = 1e-6
 
 class ModeSplit(NamedTuple):
     """Coordinates ``basis`` (n, n) in which the first ``first`` modes, those with the larger rates,
-    and all others are apart: ``inverse A basis = modal`` is block diagonal, with ``inverse`` (n, n)
-    that of the basis.
+    and all others are apart: ``inverse A basis = modal`` (n, n) is block diagonal.
     """
 
     basis: FloatArray

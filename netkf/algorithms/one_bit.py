@@ -74,8 +74,7 @@ def absorb_bits(record: Any, h: int, run: Any) -> None:
 
 @kernel
 def use_bit(record: Any, h: int, run: Any, sign: Any, r: int, k: int, arrived: Any) -> None:
-    """Correct node ``h`` by the ``sign`` (L,) of the innovation of row ``k`` of reading ``r``, in
-    the lanes with ``arrived``.
+    """Correct node ``h`` by the ``sign`` (L,) of the innovation of row ``k``, where ``arrived``.
 
     The paper's update with noise variance 1 is ``x + sqrt(2 / pi) P h' / sqrt(p + 1) sign`` and
     ``P - (2 / pi) P h' h P / (p + 1)`` with ``p = h P h'``. The latter is a Kalman update with

@@ -89,8 +89,7 @@ class PythonPairs:
         self, readings: Sequence[Any], senders: Sequence[Any], kept: Kept
     ) -> tuple[Pairs, list[Any]]:
         """Return the pairs of ``readings`` (``single.Whitened``), brought by the payloads
-        ``senders`` but for the first, and readings with those of pairs behind their own rows; the
-        node has ``kept`` some.
+        ``senders`` but for the first, and readings with those of pairs behind; some are ``kept``.
         """
         self._found, rows, first, extended = [], [], [0], []
         sizes = [self._states, *(len(payload.sender.run.struct.size) for payload in senders)]

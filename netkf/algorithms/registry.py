@@ -79,8 +79,7 @@ def built_in_class(algorithm: object) -> type[Filter] | None:
 
 
 def base_filter(algorithm: Filter) -> Filter:
-    """Return a filter of the built-in class from which a user's filter ``algorithm`` derives, with
-    the same parameters.
+    """Return the built-in parent of a user's filter ``algorithm`` with the same parameters.
 
     Raises TypeError if it derives from none.
     """

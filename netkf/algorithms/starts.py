@@ -1,6 +1,4 @@
-"""The check of wide first covariances for filters that add up information matrices, in whose
-rounding these are lost.
-"""
+"""The check of wide first covariances, which are lost in rounding of information matrices."""
 
 from __future__ import annotations
 

@@ -76,8 +76,7 @@ def silence_whitening(weight: FloatArray) -> FloatArray:
     """Return C^-1 (p, p) with the Cholesky factor C of ``I + W^-1``: that is ``R + Y^-1`` after
     whitening by R, the noise of the reading that stands for silence, and C^-1 whitens it again.
 
-    W = ``weight`` (p, p) is the trigger for whitened rows, with zeros beyond the rows of the node,
-    as the result has.
+    W = ``weight`` (p, p) is the trigger for whitened rows, with zeros beyond the node's.
     """
     # A trigger is positive definite: zeros on the diagonal are rows that the node does not have.
     rows, inverse = int((weight.diagonal() > 0.0).sum()), np.zeros(weight.shape)

@@ -63,8 +63,7 @@ class Evidence:
 
 
 class Finding(NamedTuple):
-    """The result of a test: a margin (value, low, high), the tolerated distance below 0, and a
-    message about it.
+    """The result of a test: a margin (value, low, high), a tolerated distance below 0, a message.
 
     early   : the promise is about a limit and the horizon is too short to tell
     blurred : rounding of a large state has left no errors to judge by

@@ -111,8 +111,7 @@ def pool(
 
 def compare_laws(pairs: Sequence[Pair], level: float, start: float = 0.0) -> Finding:
     """Test that samples of each pair have one law within LAW_TOLERANCE: Kolmogorov-Smirnov by
-    diagonal entry. Roundings of ``start``, the largest trace at 0, remain in P. It is ``early`` if
-    a limit law is not reached.
+    diagonal entry. Roundings of ``start``, the largest trace at 0, remain in P.
     """
     single_level, early = level / sum(pair.first.shape[-1] for pair in pairs), False
     intervals = []

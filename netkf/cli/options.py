@@ -1,7 +1,6 @@
 """The parser of the command line, and functions of several commands that parse and print values.
 
-It imports the rest of netkf inside functions, so that ``netkf --help`` and usage errors do not wait
-for numpy and numba.
+It imports the rest of netkf inside functions: ``netkf --help`` does not wait for numpy, numba.
 """
 
 from __future__ import annotations

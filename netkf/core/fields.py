@@ -1,8 +1,7 @@
 """Dataclass fields that validate their values, and the base class of scenario components.
 
 ``field(rule)`` declares a field; the rule converts the value that a file or a script gives and
-describes a wrong one in one line. Files and Python meet the same rules because both go through
-``Component.__post_init__``.
+describes a wrong one in one line. Files and Python meet the same rules, by construction.
 """
 
 from __future__ import annotations
@@ -107,9 +106,7 @@ class Component:
     """A property that reads a table: on construction, so that mistakes in the file are found."""
 
     def __new__(cls, *values: Any, **named: Any) -> Self:
-        """Return a new object; raises ScenarioError for settings without a name that must have one,
-        and for names that are none.
-        """
+        """Return a new object; raises ScenarioError for nameless or unknown settings."""
         if not is_netkf_class(cls):
             require_known_members(cls)
         # Not of classes with an __init__ of their own, which that of a dataclass is not: it has no
@@ -535,8 +532,7 @@ definite_covariance = Rule(
 def list_of(rule: Rule, items: str, min_length: int = 1) -> Rule:
     """Return the rule for a list of at least ``min_length`` values that each obey ``rule``.
 
-    ``items`` is what messages call the values, such as "node ids". An error names the index of the
-    wrong value in the list.
+    ``items`` is what messages call the values, such as "node ids". Errors name the wrong index.
     """
 
     def convert(value: Any) -> tuple[Any, ...]:

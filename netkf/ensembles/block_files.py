@@ -1,5 +1,4 @@
-"""Results of finished blocks of runs on disk: ``000000064-16.npz`` of a folder has the runs 64 to
-79 of an ensemble.
+"""Results of finished blocks on disk: ``000000064-16.npz`` has the runs 64 to 79 of an ensemble.
 
 Each is a node of the binary tree over replicas. A block is used only if its last line is the digest
 of all bytes before it, and the identity inside (run, replicas, installation) is that of the run.

@@ -106,8 +106,7 @@ class BlockCheckpoints(BlockFiles):
 
     def traces(self) -> Iterator[Trace]:
         """Yield the traces (events and samples of a run) that the blocks of this run have, in the
-        order of replicas, those not written yet included; raises EngineError if a block was damaged
-        since it was found or saved.
+        order of replicas, also those not written; raises EngineError if a block is damaged.
         """
         pending = {(k << level, 1 << level): found for level, k, found in self._pending.nodes()}
         for node in sorted({*self._nodes, *pending}):

@@ -84,8 +84,7 @@ def runs_to_directory(
     note: Callable[[str], None] | None = None,
 ) -> FinishedEnsemble | None:
     """Simulate replicas 0 .. runs - 1 and write scenario.toml, manifest.json, ensemble.parquet,
-    summary.json and the events and states of the traced runs; return the ensemble, or None if
-    ``out`` was complete before.
+    summary.json and traces; return the ensemble, or None if ``out`` was complete before.
 
     Blocks of runs are stored as they complete, and are not simulated again on resuming: all files
     are bit-identical to those without interruption. ``note`` is called with a line about blocks

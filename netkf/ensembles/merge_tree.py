@@ -1,8 +1,7 @@
 """The binary tree over replicas, by which results of many runs are merged.
 
 Node (level, k) holds the replicas from k 2^level to (k + 1) 2^level - 1. Every result is merged
-along this tree, so that its bits do not depend on the size of blocks, on the workers, or on the
-order of completion.
+along this tree: its bits do not depend on sizes of blocks, workers, or the order of ends.
 """
 
 from __future__ import annotations

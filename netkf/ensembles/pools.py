@@ -66,8 +66,7 @@ class LocalPool(Pool):
 class AdaptivePool(Pool):
     """A pool that runs blocks in this process until worker processes would save time for the rest.
 
-    An ``open_ended`` pool, which serves one job after another, expects as much work to come as it
-    has done already.
+    An ``open_ended`` pool, of one job after another, expects as much work as it has done.
     """
 
     def __init__(self, workers: int, open_ended: bool = False) -> None:

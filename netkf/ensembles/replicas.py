@@ -126,12 +126,10 @@ def replicate_blocks(
     form: Form | None = None,
 ) -> Any:
     """Return ``task(scenario, seed, replicas)`` for blocks of the replicas ``first`` .. ``first +
-    runs - 1``, merged by ``merge(a, b)``, which joins the results of neighbours (a before b) into
-    one of the same kind.
+    runs - 1``, merged by ``merge(a, b)``, which joins neighbours, a before b, into one.
 
     Results are merged in the binary tree over replicas, inside blocks by the task itself. ``task``
-    and ``merge`` are functions of a module, or partials of such, that workers can import; their
-    results must pickle.
+    and ``merge`` are functions of a module, or partials, to import and pickle.
 
     seed     : defaults to the scenario's
     pool     : a pool of make_pool, or options for one that is closed at the end

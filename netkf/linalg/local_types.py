@@ -1,7 +1,6 @@
 """The numba implementation of :mod:`netkf.linalg.local`: arrays of constant shape on the stack.
 
-They are emitted inline (``lower_builtin``) and not as overloads, which would be functions whose
-stack ends when they return.
+They are emitted inline (``lower_builtin``), not as overloads, whose stack ends on return.
 """
 
 from __future__ import annotations

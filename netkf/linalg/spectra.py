@@ -88,8 +88,7 @@ def contracts(radius: float) -> bool:
 
 def hidden_mode(A: FloatArray, C: FloatArray, border: Border | None = None) -> complex | None:
     """Return an eigenvalue of ``A`` (n, n) whose mode the outputs ``C x``, C (p, n), do not show,
-    or None (test of Popov, Belevitch and Hautus). With a ``border``, RATE or FACTOR, modes that
-    decay are skipped.
+    or None (Popov, Belevitch, Hautus). With a ``border``, RATE or FACTOR, not of decaying modes.
 
     Neither units of states that A couples nor those of all outputs together matter.
     """

@@ -12,8 +12,7 @@ numbers and the addresses and shapes of its arrays. Kernels read ``state.xhat`` 
     walk = Walk(position=np.zeros((2, 3)), steps=0)
 
 A field ``size`` may be :func:`sized`: the length of the tuple is part of the type, so that loops
-over ``range(len(size))`` have a constant length for the compiler. Each size then has a class of its
-own, ``cls.of_size(n)``.
+over ``range(len(size))`` have a constant length. Each size has a class, ``cls.of_size(n)``.
 
 Annotations ``int`` and ``float`` are numbers; all other fields are C-contiguous arrays or other
 structs, whose types are the same for all instances of a class. A struct keeps its arrays alive.

@@ -1,5 +1,4 @@
-"""Statistics of the outcomes of packets: deliveries, bursts, shared fate, and tests of what laws
-of losses assume.
+"""Statistics of the outcomes of packets: deliveries, bursts, shared fate, and tests of laws.
 
 Senders are taken as independent of each other. What hearers share, and what follows in time, is
 kept in all variances: sums go over transmissions, which are the units.

@@ -1,6 +1,4 @@
-"""A window of a run for the Perfetto UI, as JSON of the Chrome trace event format (Google, Trace
-Event Format, 2016).
-"""
+"""A window of a run for the Perfetto UI, as JSON of the Chrome trace event format (2016)."""
 
 from __future__ import annotations
 

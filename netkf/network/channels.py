@@ -100,8 +100,7 @@ class BroadcastDraw(NamedTuple):
 
 class BroadcastSampler:
     """Draws what hearers of a sender share, broadcast by broadcast, for a ``link`` of the sender.
-    ``generator`` makes the streams "broadcast" and "weather" of the sender; with one hearer only
-    there is no fate to share.
+    ``generator`` makes the streams "broadcast" and "weather" of the sender, if several hear.
     """
 
     def __init__(self, loss: Loss, link: Link, several: bool, generator: Generators) -> None:

@@ -38,8 +38,7 @@ class MessageTable:
     """A value for each listed message of each directed link (sender, receiver): ``values[link]``
     are the numbers (K,) of its messages, counted from 0, in order, and the values (K,) of these.
 
-    ``row_keys`` has the (sender, receiver, number) of each row of ``columns``: rows may repeat a
-    message and its value.
+    ``row_keys``: (sender, receiver, number) of each row of ``columns``, which may repeat.
     """
 
     columns: Columns

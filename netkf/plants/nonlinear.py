@@ -51,8 +51,7 @@ GRAPH = "graph"
 
 class Linearised:
     """A function that linearises the readings of a sensor at one of its nodes. Filters are given it
-    in the place of H, and call it with a reading and their own estimate. ``present`` (p,) flags the
-    values that are there.
+    in the place of H, for calls with a reading and an estimate; ``present`` (p,) flags values.
     """
 
     def __init__(

@@ -592,8 +592,7 @@ def fill_state_moments(
     scratch: FloatArray,
 ) -> None:
     """Write the two moments of x over ``gap`` seconds, which begin ``since`` seconds after the
-    start of a piece of ``length`` seconds, into ``out`` (2, n), from its ``course`` (D, W).
-    ``scratch`` (2 W,).
+    start of a piece of ``length`` s, into ``out`` (2, n), from its ``course`` (D, W).
     """
     first, share = since / length, gap / length
     fill_integrals(scratch, course, first, first + share)

@@ -212,8 +212,7 @@ def fill_reading(
 ) -> None:
     """Write the two moments of dy of sensor ``s``, which has ``rows`` rows, in L lanes into ``out``
     (2 q, L), where the sensors of one filter have q rows together: the first from ``row`` on, the
-    second q later. ``x_moments`` (2, n, L), ``noise`` (2, p, L); H of S sensors is (S, p, n, L),
-    root (S, p, p, L).
+    second q later. ``x_moments`` (2, n, L), ``noise`` (2, p, L); H (S, p, n, L), root (S, p, p, L).
     """
     # First moments of the rows of all sensors come before the second ones, as filters expect.
     half = len(out) // 2

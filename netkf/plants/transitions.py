@@ -22,8 +22,7 @@ class Transitions:
     L is lower triangular with a diagonal that is not negative; column k is zero if component k of
     the noise depends on those before it. Short gaps use a power series and Gauss quadrature, which
     keep the relative accuracy of entries of very different size (a chain of integrators over
-    1e-9 s); longer gaps are reached by doubling. A law has the same bits whichever others are
-    computed with it.
+    1e-9 s); longer gaps are reached by doubling. A law has the same bits beside any others.
     """
 
     def __init__(self, A: FloatArray, B: FloatArray) -> None:

@@ -164,8 +164,7 @@ def fill_states(
     offsets: FloatArray,
 ) -> None:
     """Write the states at increasing ``ticks`` (K,) into ``states`` (K, n), and those just before
-    each frame, of ``every`` cells between knots (0: none), into ``offsets`` (F, n). ``walk.x[0]``
-    is the state at time 0.
+    each frame, of ``every`` cells (0: none), into ``offsets`` (F, n). ``walk.x[0]`` is x(0).
     """
     knot, depth, frame, n = 0, 0, 0, len(size)
     enter_knot(size, cells, stream, knot, ziggurat, walk)

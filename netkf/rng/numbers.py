@@ -153,8 +153,7 @@ def next_integer(states: np.ndarray, k: int, count: int) -> Any:
     .. ``count`` - 1.
 
     ``count`` is at most 2^32 - 1. Lemire's method: of count times 32 random bits the upper half is
-    the result; products whose lower half is below 2^32 mod count are rejected, so that all results
-    are equally likely.
+    the result; products whose lower half is below 2^32 mod count are rejected: all are likely.
     """
     if count <= 1:
         return np.int64(0)

@@ -515,8 +515,7 @@ class DerivedScenario(ScenarioModel):
         sample, probe and frame times.
 
         ``frames``, by default ``exact_errors``: local states are relative to an origin that moves.
-        ``sampled`` (K,) are sample times in seconds if drawn. Raises ScenarioError if a recorded
-        truth lacks a row.
+        ``sampled`` (K,) are drawn sample times (s). Raises ScenarioError if a truth lacks a row.
         """
         frames = self.exact_errors if frames is None else frames
         if isinstance(self.plant, NonlinearDiffusion):
@@ -694,8 +693,7 @@ class DerivedScenario(ScenarioModel):
         frame is an interval in which both are taken relative to an origin near x (plants.truth).
         This needs a plant whose state and readings are all drawn, linear sensors, filters that
         believe the true A (in slots F) and commute with a shift of the state, and growth so fast
-        that a second frame begins before the horizon, or an input along whose response the origin
-        moves in any case.
+        that a second frame begins before the horizon, or an input moves the origin in any case.
         """
         # Nonlinear readings depend on the absolute state.
         if not self.is_random or not self.is_linear or not commutes(self.node_filter):

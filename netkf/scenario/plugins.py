@@ -1,5 +1,4 @@
-"""The classes of users that a scenario names: their import, list, files and failures, and the rule
-for files without trust.
+"""The classes of users that a scenario names: their import, list, files, failures and trust.
 
 Importing a module executes it, and nothing is imported to find out what a class is. Installed
 packages offer classes by entry points of the group PARTS, whose names are kinds; every other class

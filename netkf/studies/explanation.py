@@ -52,8 +52,7 @@ class Missing(NamedTuple):
 
 @dataclass(frozen=True)
 class InformationSource:
-    """The information of one ``node``, the source, that had reached the node asked about. Times are
-    in seconds, nan if unknown.
+    """What of ``node``, the source, had reached the node asked about. Times in seconds, or nan.
 
     sensor          the source has a sensor
     neighbour       the source can send to the node asked about directly

@@ -217,9 +217,7 @@ class BackwardSearch:
         return path
 
     def needed(self, messages: IntArray) -> IntArray:
-        """Return how many unused messages each of ``messages`` (K,) needs, itself included; NEVER
-        if it cannot matter.
-        """
+        """Return how many unused ones each of ``messages`` (K,) needs, or NEVER."""
         # ``deadline`` is the row before which information has to be in a segment to reach the node.
         flow = self.flow
         used, cost = flow.messages.used_row[messages], flow.cost[messages]

@@ -92,8 +92,7 @@ def has_clocked_innovations(scenario: Scenario) -> bool:
 
 class ClockedInnovations:
     """The innovations of the run of ``scenario`` that has the ``log`` and the samples ``streams``:
-    ``run`` is the same one, with samples at ``times``; ``sigma`` (T, N, n, n) is E[e e'] there,
-    None if it is unknown.
+    ``run`` is the same one, with samples at ``times``; ``sigma`` (T, N, n, n): E[e e'] or None.
 
     times : the samples of ``scenario``, and for each node instants of its sensors and its last
             events before these

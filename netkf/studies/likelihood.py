@@ -79,8 +79,7 @@ def filter_rows(
 ) -> None:
     """Run a Kalman filter from the estimate ``x`` (n, 1), ``P`` (n, n) over K instants: a
     prediction by law ``laws[k]`` of ``F`` and ``Q`` (L, n, n), then scalar readings ``y`` (M,) with
-    ``H`` (M, n) and variances ``r`` (M,), those from ``first[k]`` on. Write their innovations (M,)
-    and the variances of these.
+    ``H`` (M, n) and variances ``r`` (M,), from ``first[k]`` on; write innovations, variances (M,).
     """
     n = len(x)
     for k in range(len(laws)):
@@ -101,8 +100,7 @@ def filter_rows(
 
 
 class CentralModel:
-    """The central Kalman filter of a scenario over the readings of a ``replica``, as a function of
-    the variances of its noises.
+    """A scenario's central Kalman filter over a ``replica``'s readings, by variances of noises.
 
     times, nodes, components : (M,) seconds and ids of scalar readings, and which values of all that
                                the node reads they are
@@ -358,8 +356,7 @@ def fit_noise(
     else the size of Q), which for a random walk is its rate, and that of each component of the R of
     each ``[[sensors]]`` entry (or the size of an R that is not diagonal). What is 0 stays 0.
 
-    ``confidence`` is that of the interval of each variance. Raises ScenarioError, see
-    ``log_likelihood``.
+    ``confidence`` is that of each interval. Raises ScenarioError, see ``log_likelihood``.
     """
     require_scenario(scenario, "fit_noise")
     confidence = number(above=0.0, below=1.0)("confidence", confidence)

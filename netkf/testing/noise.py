@@ -111,8 +111,7 @@ def whitened(
     noise: FloatArray, S: FloatArray, sizes: FloatArray, where: str, rule: str, remedy: str = ""
 ) -> FloatArray:
     """Return ``noise`` (..., q) of covariance ``S`` as standard white noise (..., r). Raises
-    AssertionError unless it is 0, relative to ``sizes`` (q,), where S has no noise, or so little
-    that rounding hides it.
+    AssertionError unless it is 0, relative to ``sizes`` (q,), where S has next to no noise.
     """
     factor, null_space = whiten(S)
     visible = is_visible(factor, sizes)

@@ -71,8 +71,7 @@ def check_sensor(sensor: Any, /, **settings: Any) -> None:
     Exact checks: shapes; equal streams give equal readings, whichever other sensors are read,
     whether readings are taken one by one, several at once or with some left out, and however the
     steps of increments are cut; another state changes a reading by H times the difference; only the
-    given generators are used; the sensor survives pickle; H is the same in all readings unless the
-    sensor is ``varying``.
+    given generators are used; the sensor survives pickle; H is the same unless it is ``varying``.
 
     Statistical checks find these errors with probability 0.9 each. From 100,000 readings of all
     nodes together (of increments, 10,000 pieces of steps): a bias of 0.03 standard deviations
@@ -97,8 +96,7 @@ class ReadingSeries(NamedTuple):
 
 
 class SensorReader:
-    """Reads a sensor in slots, or the ``samples`` that it takes of a diffusion. ``name`` is that of
-    the user's class.
+    """Reads a sensor in slots, or its ``samples`` of a diffusion. ``name``: that of the class.
 
     A path, which a method of the sensor returns, gives the readings of one node in one run. ``p``
     is the number of rows of a reading, ``n`` that of states.

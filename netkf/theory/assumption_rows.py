@@ -48,8 +48,7 @@ ANY = "any filter"
 def assumptions(scenario: Scenario) -> pd.DataFrame:
     """Return a table with a row for each assumption: assumption, source, holds, evidence.
 
-    ``holds`` is None where it is not known. The paper of the scenario's filter decides which
-    assumptions there are.
+    ``holds`` is None where it is not known; the paper of the filter decides on them.
     """
     import pandas as pd
 

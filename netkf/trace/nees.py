@@ -135,8 +135,7 @@ def blurred_from(
     exact: bool = False,
 ) -> FloatArray:
     """Return for each of R runs the first of its sample ``times`` (T,), in seconds, from which on
-    errors mean little, inf if there is none: the rounding error of x - xhat exceeds 1 / BLUR of
-    their standard deviation.
+    errors mean little, or inf: rounding of x - xhat exceeds 1 / BLUR of their deviation.
 
     The rounding error is that of states x (R, T, n), with ``exact`` errors that of the errors e
     (R, T, N, n), which a node may have passed on to others. The standard deviation is the smallest

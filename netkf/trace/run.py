@@ -40,8 +40,7 @@ class Run(NotebookTable):
     ``rounding_from`` on. ``status`` is complete, interrupted or diverged. ``sums`` holds the sums
     over all nodes that exchanges should conserve: at the start and at the last sample. Unless
     ``truth_known``, x is nan and tables have no columns of errors. ``stats`` holds the counts that
-    the engine keeps of its own work. ``scenario`` is the ``netkf.Scenario`` that was simulated,
-    None if it is unknown.
+    the engine keeps of its own work. ``scenario`` is that which was simulated, or None.
     """
 
     times: FloatArray

@@ -27,8 +27,7 @@ def received_weight(run: Any) -> Any:
 @kernel
 def combine_convex(record: Any, h: int, run: Any) -> None:
     """Replace the estimate of node ``h`` by the convex combination with those heard, paper H (7)
-    and (9), with the weights of messages that do not arrive in its own: ``x = sum w_j x_j`` and
-    ``P = sum w_j P_j``.
+    and (9), with the weights of lost messages in its own: ``x = sum w_j x_j``, ``P = sum w_j P_j``.
     """
     lanes, n, root, payload = run.lanes, len(run.size), record.root, record.payload
     theirs = local_lanes_matrix(run.size, lanes, run.noise)

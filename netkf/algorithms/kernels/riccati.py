@@ -2,8 +2,7 @@
 
 P is the covariance of a Kalman-Bucy filter between messages, for a plant ``dx = A x dt + noise`` of
 covariance Q per second and sensors that give the information ``G = H' R^-1 H`` per second. The
-theory of paper H (Tanwani 2021) uses these covariances; filters carry roots of P, which
-``root_flow`` moves.
+theory of paper H (Tanwani 2021) uses these covariances; filters carry roots of P.
 
 The flow is the linear-fractional action of ``exp(M gap)`` with the Hamiltonian ``M = [[-A', G], [Q,
 A]]``: if ``[X; Y] = exp(M gap) [I; P]`` then ``P(gap) = Y X^-1``. One exponential over a long gap

@@ -245,8 +245,7 @@ def later_cells(
 
 def pack_series(parts: FloatArray, observed: bool) -> FloatArray:
     """Return the series (C, terms, width) of a FlowTable for C cells from those of exp(A g), F,
-    Q_g and G_g in ``parts`` (4, C, terms, n, n): one row for each term, without F and G_g unless
-    something is ``observed``.
+    Q_g and G_g in ``parts`` (4, C, terms, n, n): a row for each term; F, G_g if ``observed``.
     """
     E, F, Q_g, G = parts
     rows, columns = np.tril_indices(E.shape[2])
@@ -274,8 +273,7 @@ def transition_series(
 ) -> FloatArray:
     """Return Taylor coefficients (4, C, terms, n, n) of exp(A g), the transition F, the noise Q_g
     and the information G_g of the readings over gaps around the middles of C cells, in extended
-    precision, for A and Q (n, n) and ``whitened_H`` (q, n). ``starts`` (4, C, n, n) are their
-    values at the middles.
+    precision, for A and Q (n, n) and ``whitened_H`` (q, n), from ``starts`` (4, C, n, n).
 
     ``dF = (A - Q_g G) F``, ``dQ_g = A Q_g + Q_g A' + Q - Q_g G Q_g`` and ``dG_g = F' G F``, with
     the information rate ``G = whitened_H' whitened_H``.
@@ -535,8 +533,7 @@ def is_narrow(table: FlowTable, m: int, gap: float, trace: float) -> bool:
 @kernel(inlined=True)
 def takes_one_step(table: FlowTable, m: int, gap: float, trace: float) -> bool:
     """Return True if ``propagate_root`` moves a P of this ``trace`` over ``gap`` seconds in one
-    step, by the series of a cell, with model ``m`` of the table: only then the compiled engine can
-    do so in SIMD lanes.
+    step, by the series of a cell, with model ``m`` of the table: then SIMD lanes can do so.
     """
     longest = table.unit[m] * (1 << table.sizes[m, 4])
     return bool(gap < longest and is_narrow(table, m, gap, trace))
@@ -845,8 +842,7 @@ def gain_root(
 ) -> None:
     """Correct the prediction ``x[k]`` (n,) at the end of a ``gap`` in seconds, entry ``k`` of x
     (K, n), in place by the Legendre ``moments`` (2 p,) of its readings, which are overwritten with
-    the innovations ``moments - C x``: ``x += (U + S S' W) innovations``, with the root S =
-    ``root[k]`` (n, n).
+    ``moments - C x``: ``x += (U + S S' W) innovations``, with the root S = ``root[k]`` (n, n).
 
     U and W (n, 2 p) and C (2 p, n) are power series in the gap, the rows of ``series`` (terms, ...)
     of a GainTable; ``reach[:, column]`` (terms,) is the longest gap for which the terms so far

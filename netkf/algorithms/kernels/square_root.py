@@ -39,8 +39,7 @@ def lower_root(root: FloatArray) -> FloatArray:
 def reflect(work: FloatArray, i: int, c: int, rows: int, columns: int) -> None:
     """Apply, from the right and in place, the Householder reflection of the columns ``c`` to
     ``columns`` - 1 of ``work`` (>= rows, >= columns) that zeroes row ``i`` right of column ``c``,
-    to the rows ``i`` to ``rows`` - 1. In row ``i`` itself the entries right of that column are not
-    cleared: read them as zeros.
+    to the rows ``i`` to ``rows`` - 1. In row ``i`` entries right of that column mean zero.
     """
     square = 0.0
     for j in range(c, columns):
@@ -72,8 +71,7 @@ def reflect_row(
     ``on`` lanes (flags (L,) of runs side by side).
 
     wide and T are (n, n, L), T lower triangular. Row ``i`` has the squared length ``square`` (L,);
-    in ``W`` its entries are in columns ``i`` to ``end`` - 1. Row ``i`` itself is not cleared
-    right of its diagonal.
+    in ``W`` its entries are in columns ``i`` to ``end`` - 1, right of its diagonal as they were.
     """
     # With v = row i + signed e_i the reflection is I - v v' / (length head).
     n, pivot = len(size), load(lanes, W, i, i)

@@ -66,8 +66,7 @@ def is_near(
 ) -> Any:
     """Return flags (L,) of the runs in which a copy is near the estimate, so that the node need not
     send: ``|S^-1 (x - xbar)|^2 < alpha`` and ``P < bound Pbar`` and ``Pbar < bound P``, with
-    x = ``x[h]`` and the root S = ``root[h]`` of P, xbar = ``copies_x[k]`` and the root
-    ``copies_root[k]`` of Pbar.
+    x = ``x[h]``, S = ``root[h]`` of P, xbar = ``copies_x[k]``, ``copies_root[k]`` of Pbar.
     """
     lanes, n, ratio, work = run.lanes, len(run.size), run.total, run.noise
     distance = spread(lanes, 0.0)

@@ -503,8 +503,7 @@ def queue_pairs(state: Simulation, visits: Visits, k: int, first: int, now: floa
 @kernel
 def set_receiving_link(visits: Visits, v: int, first: bool, direction: int) -> None:
     """Enter in visit ``v`` (index in ``visits.records``) of two nodes the index ``direction`` of a
-    directed link whose message arrives: over it the first node of the visit receives if ``first``,
-    otherwise the second one.
+    directed link whose message arrives: the first node receives if ``first``, else the second.
     """
     if first:
         visits.records[v].to_first = direction

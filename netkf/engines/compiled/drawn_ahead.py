@@ -1,6 +1,4 @@
-"""Random numbers of many streams, by their numbers in the stream: drawn when they are needed, many
-of a stream at a time.
-"""
+"""Random numbers of many streams, by their numbers there: drawn when needed, many at a time."""
 
 from __future__ import annotations
 

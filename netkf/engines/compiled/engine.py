@@ -43,8 +43,7 @@ PLANTS = (
 @dataclass(frozen=True)
 class CompiledEngine(Engine):
     """Runs all built-in plants, linear sensors and filters. Clocks, losses, delays and sensors that
-    take samples or read in slots may be a user's own, since Python can draw what they do; filters
-    if they are kernels.
+    take samples or read in slots may be a user's own; filters if they are kernels.
     """
 
     name = "compiled"

@@ -22,8 +22,7 @@ def read_increments(
 ) -> None:
     """Write the two moments of what node ``h`` reads over [now, end] (seconds), in the step of
     ``piece``, into ``out`` (2 p,), of all rows the first moment before the second;
-    ``scratch.state_moments`` has those of x. Noise that is used is taken away from
-    ``sensing.noise``.
+    ``scratch.state_moments``: those of x. Used noise leaves ``sensing.noise``.
     """
     sensing, early = state.sensing, state.scratch.early
     x, H, root, row = state.scratch.state_moments, sensing.H, sensing.root, 0

@@ -134,8 +134,7 @@ def read_alone(
     """Write the readings of one node, in lane ``q`` of ``r.moments`` (q, L), by the scalar
     kernels: for networks in which some node has several sensors, which lanes do not handle. The
     readings are the two moments of each row of increments of node ``h`` (index) of run number
-    ``run`` over [now, end] (seconds); ``piece`` is the index of a piece of the path in the step
-    that ``end`` lies in.
+    ``run`` over [now, end] (s); ``piece`` is that of the path in the step of ``end``.
     """
     count = state.gains.moments[state.nodes[h].model]
     found, moments = state.scratch.moments[:count], r.moments

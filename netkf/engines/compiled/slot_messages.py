@@ -182,8 +182,7 @@ def draw_by_link(
     runs: int,
 ) -> None:
     """Draw as ``draw_messages``, in a half to a quarter of the time, link by link: all links send,
-    with delivery probabilities that stay, and slots begin with fresh draws. ``units`` is scratch
-    for the draws of some slots.
+    with delivery probabilities that stay, and fresh draws in slots. ``units`` is scratch.
     """
     channels, steps = links.channels, up.shape[2]
     slots = len(units) // steps

@@ -381,8 +381,7 @@ def prefetch_path_and_noise(state: Simulation, visits: Visits, v: int, place: in
 @kernel
 def process_intervals(state: Simulation, visits: Visits) -> None:
     """Predict all sensing nodes in the queue ``visits.intervals`` up to the times of their visits,
-    using their increments, L nodes at a time, one in each SIMD lane; empties the queue. Changes
-    ``state.xhat`` and ``root``.
+    using their increments, L at a time in SIMD lanes; empties the queue, in ``state``.
     """
     while visits.first_interval < visits.after_intervals:
         # begin_interval() adds the next interval of a node behind the others, so the queue ends
@@ -513,8 +512,7 @@ def scatter_states(state: Simulation, places: IntArray, x: FloatArray, S: FloatA
 @kernel
 def predict_unobserved(state: Simulation, visits: Visits) -> None:
     """Predict the ``visits.waiting`` queued nodes without increment sensors, at most L, side by
-    side over the gaps of their UNOBSERVED lanes (those of such nodes), and empty these. Changes
-    ``state.xhat`` and ``root``.
+    side over the gaps of their UNOBSERVED lanes, and empty these. Changes ``state``.
     """
     n, count, places = len(state.size), visits.waiting, visits.places[UNOBSERVED]
     if count == 0:

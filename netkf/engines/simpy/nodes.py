@@ -470,8 +470,7 @@ class ClockedNode(Node):
 
     def _read(self, end: float, shown: float) -> FloatArray:
         """Return the moments (2 p,) of the increments of all sensors since those before, up to
-        ``end``, when the clock shows ``shown`` (both in s); time by a clock is a multiple of time,
-        which does not change them.
+        ``end``, when the clock shows ``shown`` (both in s), the readings being the same.
         """
         truth, start, self._read_to = self._truth, self._read_to, end
         x_moments = truth.moments(start, end)

@@ -2,8 +2,7 @@
 
 A message on direction k moves the error of its receiver i towards that of its sender j by W_k,
 ``e_i + W_k (s_j - s_i)``, where s are estimates or predictions. With delta_k = 1 if it arrives an
-exchange is ``D = sum_k delta_k E_i W_k (E_j - E_i)'``, and only means and covariances of delta
-enter second moments.
+exchange is ``D = sum_k delta_k E_i W_k (E_j - E_i)'``, with means and covariances of delta.
 """
 
 from __future__ import annotations

@@ -89,8 +89,7 @@ def riccati_step(
     """Return ``f_1(P) = F P F' + Q - F P H' (H P H' + R)^-1 H P F'`` (n, n), paper R (17).
 
     A slot with a reading; P, F and Q are (n, n), H (p, n), R (p, p). Computed from square roots by
-    an orthogonal triangularisation, which subtracts nothing. Raises TheoryError if shapes or
-    definiteness are wrong.
+    an orthogonal triangularisation, which subtracts nothing. Raises TheoryError.
     """
     system = check_system(F, Q, H, R)
     start = as_covariance("P", P, len(system.F))
