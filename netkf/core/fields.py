@@ -373,7 +373,9 @@ def instance_of(*classes: type) -> Rule:
     names = " or ".join(
         f"a{'n' if cls.__name__[0] in 'AEIO' else ''} {cls.__name__.lower()}" for cls in classes
     )
-    return Rule(f"must be {names}", convert, 'write a table { kind = "...", ... }')
+    made = " or ".join(cls.__name__ for cls in classes)
+    remedy = f'write a table {{ kind = "...", ... }}, or in Python an object of class {made}'
+    return Rule(f"must be {names}", convert, remedy)
 
 
 def stated(*classes: type, optional: bool = False) -> Rule:
