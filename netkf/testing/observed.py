@@ -21,6 +21,7 @@ from netkf.algorithms.filter import (
     interval_rule,
     may_be_silent,
 )
+from netkf.algorithms.single import NodeState
 from netkf.linalg.arrays import FloatArray
 from netkf.testing.watching import WatchedPart, collect_leaves, demand, demand_array, differing_path
 
@@ -331,6 +332,10 @@ def check_estimate(
     if pair[1] is None:
         return xhat, None
     P = demand_array(where, "P", pair[1], (n, n), "return None where the filter has no P")
+    if isinstance(state, NodeState):  # which kernels have written
+        above = float(np.abs(np.triu(state.root, 1)).max())
+        rule, got = "root must be lower triangular in kernels", f"{above:.3g} above the diagonal"
+        demand(above == 0.0, where, rule, got, "write a lower triangular root of the same P")
     size = max(float(np.abs(P).max()), np.finfo(float).tiny)
     asymmetry = float(np.abs(P - P.T).max())
     rule, got = "P must be symmetric", f"P - P' of up to {asymmetry:.3g}"

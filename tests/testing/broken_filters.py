@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from netkf.algorithms.baselines import Local
 from netkf.algorithms.filter import Estimate, Filter
 from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.hybrid import Hybrid
@@ -13,6 +14,7 @@ from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.push_sum import MASS, PushSum
 from netkf.algorithms.single import Payload
 from netkf.algorithms.traits import Analysis, Timing, Weights
+from netkf.kernels import Kernels, kernel, load, store, use_reading
 
 BROKEN = {}
 
@@ -400,3 +402,21 @@ class Gates(Gossip):
 
     def shift(self, state, offset):
         return state._replace(xhat=state.xhat + offset)
+
+
+@kernel
+def turned(record, h, run):
+    lanes, root = run.lanes, record.root
+    use_reading(run, record.xhat, root, h, run.reading, True)
+    if len(run.size) > 1:  # the first two columns change places
+        for i in range(len(run.size)):
+            first, second = load(lanes, root, h, i, 0), load(lanes, root, h, i, 1)
+            store(lanes, root, h, i, 0, second)
+            store(lanes, root, h, i, 1, first)
+
+
+@says("Turned.estimate after update: root must be lower triangular in kernels")
+class Turned(Local):
+    """Its root stands for the right P, but kernels read one half of it."""
+
+    kernels = Kernels(update=turned)
