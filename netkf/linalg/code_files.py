@@ -17,13 +17,18 @@ import shutil
 import stat
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from types import CodeType, ModuleType
 from typing import Any
+
+import numpy as np
 
 MARK = b"netkf code 1\n"
 """First bytes of an index, before its digest."""
+VALUES = (bool, int, float, complex, str, bytes, tuple, np.ndarray, np.generic)
+"""Types of what compiled code has instead of a name, with its value at that time."""
 
 
 class CodeFiles:
@@ -147,22 +152,53 @@ def _describe(function: Callable[..., Any], path: str, state: str) -> bytes:
     return json.dumps([state, source, *names, *versions]).encode()
 
 
-def _constants(function: Callable[..., Any]) -> list[Any]:
+def _constants(function: Callable[..., Any], seen: tuple[Any, ...] = ()) -> list[Any]:
     """Return what a function takes from those around it; of kernels what they are made of."""
     values: list[Any] = [cell.cell_contents for cell in function.__closure__ or ()]
-    # Kernels that users' kernels name: their files are no part of the state of netkf's sources.
+    # Values and kernels of any module, for users': their files are no part of the state of netkf's
+    # sources.
     if not function.__module__.startswith("netkf."):
-        names = (function.__globals__.get(name) for name in function.__code__.co_names)
-        values += [value for value in names if hasattr(value, "loops")]
-    return [_describe_kernel(v.loops) if hasattr(v, "loops") else v for v in values]
+        names = _names_in(function.__code__)
+        values += _named(names, function.__globals__, set())
+    return [_describe_value(value, (*seen, function)) for value in values]
 
 
-def _describe_kernel(loops: Callable[..., Any]) -> list[Any]:
-    """Return what the code of a kernel depends on."""
+def _names_in(code: CodeType) -> list[str]:
+    """Return the names in a function's code, also of functions in it, sorted."""
+    inner = (part for part in code.co_consts if isinstance(part, CodeType))
+    return sorted({*code.co_names, *(name for part in inner for name in _names_in(part))})
+
+
+def _named(names: Sequence[str], scope: Mapping[str, Any], seen: set[int]) -> list[Any]:
+    """Return what of ``names`` is a value or a kernel in a ``scope``, or in modules and classes in
+    it.
+    """
+    found: list[Any] = []
+    for value in (scope[name] for name in names if name in scope):
+        if isinstance(value, (ModuleType, type)) and id(value) not in seen:
+            found += _named(names, vars(value), seen | {id(value)})
+        elif isinstance(value, VALUES) or _function_of(value) is not None:
+            found.append(value)
+    return found
+
+
+def _function_of(value: Any) -> Any:
+    """Return the Python function of a kernel, or of another function that numba compiles."""
+    return getattr(value, "loops", getattr(value, "py_func", None))
+
+
+def _describe_value(value: Any, seen: tuple[Any, ...]) -> Any:
+    """Return what code depends on that contains a value, or calls a kernel."""
+    if isinstance(value, tuple):
+        return [_describe_value(part, seen) for part in value]
+    loops = _function_of(value)
+    if loops is None:
+        return value
     described: list[Any] = [loops.__module__, loops.__qualname__, loops.__code__.co_firstlineno]
     if not loops.__module__.startswith("netkf."):
         described.append(_digest(Path(inspect.getfile(loops)).read_bytes()))
-    return [*described, *_constants(loops)]
+    # Kernels may call themselves and each other.
+    return described if loops in seen else [*described, *_constants(loops, seen)]
 
 
 def _digest(*parts: bytes) -> bytes:

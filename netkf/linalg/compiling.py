@@ -17,7 +17,7 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cache, cached_property, update_wrapper
 from importlib import import_module
@@ -191,14 +191,7 @@ class Kernel:
         returned = numba.types.float64 if returns_number else numba.types.void
         kinds = tuple(map(numba.typeof, arguments))
         options = {k: v for k, v in self._known_options().items() if k != "no_cfunc_wrapper"}
-        try:
-            from numba.core.ccallback import CFunc
-
-            entry: Any = CFunc(self.loops, (kinds, returned), {}, options)
-            _if_numba_can(_compile_well, entry, "compile", self.loops)
-            entry.compile()
-        except (ImportError, AttributeError, TypeError):  # a private name of numba is missing
-            entry = numba.cfunc(returned(*kinds), **options)(self.loops)
+        entry = compile_c_function(self.loops, returned(*kinds), options)
         self._entries.append(entry)
         return int(entry.address)
 
@@ -207,6 +200,21 @@ class Kernel:
 
     def _known_options(self) -> dict[str, Any]:
         return {name: self._options[name] for name in self._options.keys() - _unknown_options()}
+
+
+def compile_c_function(
+    loops: Callable[..., Any], signature: Any, options: Mapping[str, Any]
+) -> Any:
+    """Return the C function of a Python function, compiled or loaded from disk."""
+    try:
+        from numba.core.ccallback import CFunc
+
+        entry: Any = CFunc(loops, (signature.args, signature.return_type), {}, dict(options))
+        _if_numba_can(_compile_well, entry, "compile", loops)
+        entry.compile()
+    except (ImportError, AttributeError, TypeError):  # a private name of numba is missing
+        entry = require_numba().cfunc(signature, **options)(loops)
+    return entry
 
 
 def require_quiet(loops: Callable[..., Any], seen: set[Any]) -> None:

@@ -11,6 +11,7 @@ from numba import types
 from numba.extending import lower_builtin, type_callable
 
 from netkf.linalg.addresses import call_at, call_at_two, number_at
+from netkf.linalg.compiling import compile_c_function
 from netkf.linalg.functions import call_function
 from netkf.linalg.struct_types import StructType
 
@@ -30,7 +31,8 @@ def compile_function(function: Any, shapes: tuple[Any, Any, Any], takes_period: 
     def call_shortly(x: Any, u: Any, t: Any, _period: Any, out: Any) -> None:
         function(carray(x, of_x), carray(u, of_u), t, carray(out, of_out))
 
-    return _numba.cfunc(_SIGNATURE, error_model="numpy")(call if takes_period else call_shortly)
+    made = call if takes_period else call_shortly
+    return compile_c_function(made, _SIGNATURE, {"error_model": "numpy"})
 
 
 @type_callable(call_function)

@@ -248,7 +248,14 @@ def find(table: np.ndarray, values: np.ndarray, value: int) -> int:
     """Return the place of a value in sorted ``values``, by a ``table`` of places unless empty."""
     if len(table) > 0:
         return int(table[value])
-    return int(np.searchsorted(values, value))
+    low, high = 0, len(values)
+    while low < high:
+        middle = (low + high) // 2
+        if values[middle] < value:
+            low = middle + 1
+        else:
+            high = middle
+    return low
 
 
 @kernel

@@ -1,5 +1,6 @@
 """Compiled code on disk: what is damaged, foreign or another user's is compiled again, not run."""
 
+import importlib
 import json
 import os
 import pickle
@@ -72,6 +73,49 @@ def file_of(cache, function, suffix):
 def test_code_is_found_again(cache):
     assert call(halved) == (1.5, 0)
     assert {path.suffix for path in cache.rglob("*") if path.is_file()} >= {".nbi", ".nbc"}
+
+
+SCALED = """from netkf.kernels import kernel
+import units
+from units import OFFSET, ROW, Gain, shifted
+
+
+@kernel
+def scaled(x):
+    return shifted(units.FACTOR * x) + OFFSET + ROW[1] + Gain.HIGH.value
+"""
+UNITS = """import enum
+from netkf.kernels import kernel
+
+FACTOR, OFFSET, ROW = 2.0, 10.0, (0.0, 100.0)
+
+
+class Gain(enum.IntEnum):
+    HIGH = 1000
+
+
+@kernel
+def shifted(x):
+    return x
+"""
+
+
+def test_code_follows_what_a_kernel_takes_from_other_modules(tmp_path, monkeypatch):
+    """Imported values and kernels, and attributes of modules and enumerations."""
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "scaled.py").write_text(SCALED)
+    changes = ("", ""), ("2.0,", "3.0,"), ("10.0", "20.0"), ("100.0)", "200.0)"), ("1000", "2000")
+    found = []
+    for old, new in (("", ""), *changes, ("return x", "return x + 4.0")):
+        (tmp_path / "units.py").write_text(UNITS.replace(old, new))
+        for name in ("scaled", "units"):
+            monkeypatch.delitem(sys.modules, name, raising=False)
+        importlib.invalidate_caches()
+        monkeypatch.setattr(sys, "dont_write_bytecode", True)
+        found.append(call(importlib.import_module("scaled").scaled.loops))
+    values = 1116.0, 1119.0, 1126.0, 1216.0, 2116.0, 1120.0
+    assert found == [(1116.0, 1), (1116.0, 0), *((value, 1) for value in values[1:])]
 
 
 def truncate(path, planted):
