@@ -279,8 +279,15 @@ def _assumptions(scenario: Scenario) -> list[Assumption]:
         evidence = f"mean-square radius {radius:.4g}, light tails below {HEAVY_TAIL_RADIUS}"
     except TheoryError as error:
         light, evidence = False, str(error)
+    algorithm: Any = with_promised_filter(scenario).filter.algorithm
+    holds = algorithm.stop == "never" and not algorithm.asymptotic
+    told = "exchanged for ever" if holds else "gains are frozen or taken from the limit"
+    if not np.array_equal(scenario.slot_belief[0], scenario.linear_plant.F):
+        holds, told = False, "exchanged, but the filters' F is not the plant's"
+    if any(sensor.varying for sensor in scenario.sensors):
+        holds, told = False, "exchanged, but H differs from slot to slot"
     return [
-        _every_slot(scenario),
+        Assumption("mass is exchanged in every slot", "P step 2", holds, told),
         Assumption("mean squares have a variance", "derived", light, evidence),
         *usual_assumptions(scenario),
     ]
@@ -300,17 +307,6 @@ def _promises(scenario: Scenario) -> tuple[Promise, ...]:
         exact_minimum_gamma(promised, most=MAX_CERTIFIED)
         promises = (*promises, CERTIFIED)
     return promises
-
-
-def _every_slot(scenario: Scenario) -> Assumption:
-    algorithm: Any = with_promised_filter(scenario).filter.algorithm
-    holds = algorithm.stop == "never" and not algorithm.asymptotic
-    evidence = "exchanged for ever" if holds else "gains are frozen or taken from the limit"
-    if not np.array_equal(scenario.slot_belief[0], scenario.linear_plant.F):
-        holds, evidence = False, "exchanged, but the filters' F is not the plant's"
-    if any(sensor.varying for sensor in scenario.sensors):
-        holds, evidence = False, "exchanged, but H differs from slot to slot"
-    return Assumption("mass is exchanged in every slot", "P step 2", holds, evidence)
 
 
 CHECKS = PaperChecks(_promises, _assumptions, summarise_drift, PushSumSamples, slots_only=True)

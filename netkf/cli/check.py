@@ -38,7 +38,11 @@ def _check(scenario: Scenario, options: argparse.Namespace) -> int:
     if earlier is not None and is_complete:
         verdict = earlier
     else:
-        verdict = _run_check(scenario, options, earlier)
+        with _explain_interrupt(options, earlier), ProgressLine() as line:
+            settings = {**pool_settings(options), "progress": line.make_count_update("runs")}
+            settings |= {name: getattr(options, name) for name in ("confidence", "until")}
+            settings |= {"most": options.most or MAX_LOOKED_RUNS, "earlier": earlier}
+            verdict = check(scenario, options.runs, **settings)
     command = _replay_command(options)
     text = verdict_text(verdict, scenario.claim, command)
     # Samples are taken at other times than those of ``probe``, at which states are recorded.
@@ -58,14 +62,6 @@ def _check(scenario: Scenario, options: argparse.Namespace) -> int:
         result = "nothing left to do in" if is_complete else "written to"
         print(f"{result} {options.out}")
     return 0 if verdict else FAILED
-
-
-def _run_check(scenario: Scenario, options: argparse.Namespace, earlier: Verdict | None) -> Verdict:
-    with _explain_interrupt(options, earlier), ProgressLine() as line:
-        settings = {**pool_settings(options), "progress": line.make_count_update("runs")}
-        settings |= {name: getattr(options, name) for name in ("confidence", "until")}
-        most = options.most or MAX_LOOKED_RUNS
-        return check(scenario, options.runs, **settings, most=most, earlier=earlier)
 
 
 @contextlib.contextmanager

@@ -129,7 +129,12 @@ def _check_entity(watched: WatchedPart, entity: Entity) -> None:
     watched.demand("origin", is_finite, "must be a finite number", origin)
     read = partial(_read_ticks, watched, entity)
     one = watched.repeat("ticks", lambda random: read(BLOCKS[0], random))
-    _check_increasing(watched, one)
+    rule, remedy = "must be finite", "return fewer times when the clock stops"
+    watched.demand("ticks", np.isfinite(one).all(), rule, "nan or inf", remedy)
+    for k in np.flatnonzero(np.diff(one, prepend=0.0) <= 0.0)[:1].tolist():
+        gap = one[k] - (one[k - 1] if k else 0.0)
+        got = f"tick {k} at {one[k]:g} s, {gap:g} s after the one before"
+        watched.demand("ticks", False, "times must be above 0 and increase", got)
     rule = "must not depend on the size of the blocks"
     for blocks in BLOCKS[1:]:
         other = read(blocks)
@@ -187,15 +192,6 @@ def _read_ticks(
         has_stopped = not len(block)
         times = np.concatenate([times, block])
     return times
-
-
-def _check_increasing(watched: WatchedPart, times: FloatArray) -> None:
-    rule, remedy = "must be finite", "return fewer times when the clock stops"
-    watched.demand("ticks", np.isfinite(times).all(), rule, "nan or inf", remedy)
-    for k in np.flatnonzero(np.diff(times, prepend=0.0) <= 0.0)[:1].tolist():
-        gap = times[k] - (times[k - 1] if k else 0.0)
-        got = f"tick {k} at {times[k]:g} s, {gap:g} s after the one before"
-        watched.demand("ticks", False, "times must be above 0 and increase", got)
 
 
 def _check_laws(watched: WatchedPart, entities: tuple[Entity, ...], seed: int) -> None:

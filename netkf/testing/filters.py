@@ -71,7 +71,12 @@ def check_filter(filter: Any, /, same_as_parent: bool | None = None, **settings:
     demand_kind("same_as_parent", same_as_parent, bool)
     watched = WatchedPart(part)
     watched.pickle_copy()
-    _check_values(watched)
+    _check_flags(watched, "needs", part.needs, Needs)
+    _check_flags(watched, "timing", part.timing, Timing)
+    clocks = part.timing.clocks
+    can_run = bool(clocks) or part.timing.schedule is not None or not part.timing.talks
+    rule = "must name a clock where schedule is None: the filter could not run at all"
+    watched.demand("timing.clocks", can_run, rule, clocks)
     if part.timing.talks:
         _check_weights(watched)
     if part.timing.schedule is not None:
@@ -98,16 +103,6 @@ def _check_shift(watched: WatchedPart, seen: list[Seen], shifted: list[Seen]) ->
             got = f"{name} of node {one.node} after {one.after} that differs by {difference:.3g}"
             got += " once truth, states and payloads are shifted"
             watched.demand("shift", difference <= SHIFT_TOLERANCE * size, rule, got, remedy)
-
-
-def _check_values(watched: WatchedPart) -> None:
-    part, demand = watched.part, watched.demand
-    _check_flags(watched, "needs", part.needs, Needs)
-    _check_flags(watched, "timing", part.timing, Timing)
-    clocks = part.timing.clocks
-    can_run = bool(clocks) or part.timing.schedule is not None or not part.timing.talks
-    rule = "must name a clock where schedule is None: the filter could not run at all"
-    demand("timing.clocks", can_run, rule, clocks)
 
 
 def _check_flags(watched: WatchedPart, name: str, value: Any, kind: type[Any]) -> None:

@@ -171,12 +171,6 @@ class DelayedJumps:
         noise = np.tensordot(self._integral, E @ self.Q @ np.swapaxes(E, 1, 2), 1)
         return E @ covariance[::-1], symmetric(noise[-1])
 
-    def _heard_products(self, K: FloatArray) -> FloatArray:
-        """Return H K(d - s)' (k + 1, M, M); points are symmetric, so K(d - s) is K reversed."""
-        k, M, _ = K.shape
-        columns = np.ascontiguousarray(K[::-1].transpose(2, 0, 1)).reshape(M, k * M)
-        return np.asarray((self._coupling @ columns).reshape(M, k, M).swapaxes(0, 1))
-
     def _driven_by(self, Phi: FloatArray) -> FloatArray:
         """Return the right-hand side (k + 1, M, M) for white noise of covariance Phi per second."""
         right = np.zeros((self.points + 1, *Phi.shape))
@@ -189,7 +183,9 @@ class DelayedJumps:
         # With ``jumps`` Phi is the inflow computed from K.
         k, M, _ = K.shape
         driven = (self._drift_blocks @ K.reshape(k, self.nodes, -1, M)).reshape(K.shape)
-        heard = self._heard_products(K)
+        # H K(d - s)' (k + 1, M, M): points are symmetric, so K(d - s) is K reversed.
+        columns = np.ascontiguousarray(K[::-1].transpose(2, 0, 1)).reshape(M, k * M)
+        heard = np.asarray((self._coupling @ columns).reshape(M, k, M).swapaxes(0, 1))
         residual = right + K[0] - K + np.tensordot(self._integral, driven + heard, 1)
         # The antisymmetric part of this entry is the condition K(0) = K(0)'.
         residual[0] = right[0] + 2.0 * symmetric(driven[0] + heard[0]) + 0.5 * (K[0].T - K[0])

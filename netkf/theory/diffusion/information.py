@@ -75,8 +75,14 @@ def information_level(
     if window is None:
         longest = 2 * scenario.plant.n
         window = next((h for h in range(1, longest) if _make_row(*network, h)[2] > 0.0), longest)
-    rows = [_make_row(*network, window)]
-    rows += _sensor_rows(sources, past, window)
+    # Each sensor alone; fixed regressors of one kind share the numbers of the first.
+    alone: dict[int, LevelRow] = {}
+    for group in _group_by_kind(sources):
+        for k in group:
+            shared_row = alone.get(group[0]) if not sources[k].drive.size else None
+            sensor_row = shared_row or _make_row(sources[k].node, [sources[k]], [past[k]], window)
+            alone[k] = (sources[k].node, *sensor_row[1:])
+    rows = [_make_row(*network, window), *(alone[k] for k in range(len(sources)))]
     names = ["node", "window", "level", "low", "high", "mean", "mean_low", "mean_high"]
     return pd.DataFrame(rows, columns=names)
 
@@ -140,17 +146,6 @@ def _draw_states(source: _Source, slots: np.ndarray, random: np.random.Generator
         with np.errstate(over="ignore", invalid="ignore"):
             mean, cov = source.A @ mean, source.A @ cov @ source.A.T + source.drive
     return states
-
-
-def _sensor_rows(sources: list[_Source], past: list[FloatArray], window: int) -> list[LevelRow]:
-    """Return the row of each sensor alone; fixed regressors of one kind share its numbers."""
-    rows: list[LevelRow | None] = [None] * len(sources)
-    for group in _group_by_kind(sources):
-        for k in group:
-            shared_row = rows[group[0]] if not sources[k].drive.size else None
-            sensor_row = shared_row or _make_row(sources[k].node, [sources[k]], [past[k]], window)
-            rows[k] = (sources[k].node, *sensor_row[1:])
-    return [row for row in rows if row is not None]
 
 
 def _make_row(node: int, sources: list[_Source], past: list[FloatArray], window: int) -> LevelRow:

@@ -105,8 +105,10 @@ def _probability(
     adjacency = scipy.sparse.coo_array((np.ones(pairs.shape[1]), pairs), shape=(nodes, nodes))
     if scipy.sparse.csgraph.connected_components(adjacency, directed=False)[0] > 1:
         return Probability(1.0, 1.0, 1.0, exact=True)
-    order = _elimination_order(neighbours)
-    cut = None if order is None else _exact_probability(neighbours, order)
+    # Greedy orders from several first nodes: a node is open while some neighbours are not taken.
+    roots = sorted(range(nodes), key=lambda node: len(neighbours[node]))[:MAX_ROOTS]
+    orders = [found for root in roots if (found := _greedy_order(neighbours, root)) is not None]
+    cut = _exact_probability(neighbours, min(orders)[1]) if orders else None
     if cut is not None:
         return Probability(cut, cut, cut, exact=True)
     if samples is None:
@@ -199,15 +201,6 @@ def _channel_probabilities(scenario: Scenario) -> dict[Edge, float]:
             raise TheoryError("the two directions of a link fail apart: give delivery")
         probabilities[i, j] = forward
     return probabilities
-
-
-def _elimination_order(neighbours: list[dict[int, float]]) -> list[int] | None:
-    """Return the greedy order of least effort from several first nodes; None if too many open."""
-    # A node is open while it is taken and some of its neighbours are not.
-    nodes = range(len(neighbours))
-    roots = sorted(nodes, key=lambda node: len(neighbours[node]))[:MAX_ROOTS]
-    orders = [_greedy_order(neighbours, root) for root in roots]
-    return min((order for order in orders if order is not None), default=(0.0, None))[1]
 
 
 def _greedy_order(neighbours: list[dict[int, float]], root: int) -> tuple[float, list[int]] | None:
