@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from netkf.core.contracts import is_netkf_class
 from netkf.core.csv_files import Columns, read_columns, read_header
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import MAX_MAGNITUDE, SourceFile
@@ -446,7 +447,8 @@ def readings_of(
     if hasattr(path, "parts"):
         yield from path.parts(slot, x, R)
     else:
-        yield path.reading(slot, x), path.matrix(slot), covariance_of(path, slot, R)
+        y, H = path.reading(slot, x), path.matrix(slot)
+        yield own_reading(path, y, H, x), H, covariance_of(path, slot, R)
 
 
 def read_many(path: Any, numbers: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -457,5 +459,29 @@ def read_many(path: Any, numbers: Sequence[int], x: FloatArray) -> tuple[FloatAr
     # What a user's class must have: ``reading`` of a sample gives y and H, in a slot y alone.
     pairs = [(path.reading(k, state), k) for k, state in zip(numbers, x, strict=True)]
     if hasattr(path, "matrix"):
-        return np.array([y for y, _ in pairs]), np.array([path.matrix(k) for _, k in pairs])
-    return np.array([y for (y, _), _ in pairs]), np.array([H for (_, H), _ in pairs])
+        pairs = [(y, path.matrix(k)) for y, k in pairs]
+    else:
+        pairs = [pair for pair, _ in pairs]
+    rows = [own_reading(path, y, H, state) for (y, H), state in zip(pairs, x, strict=True)]
+    if any(len(y) != len(H) for y, (_, H) in zip(rows, pairs, strict=True)):
+        rule = f"{type(path).__name__}.reading gives no values at times, which only SimPy takes"
+        raise ScenarioError("sensors", rule, None, 'use engine="simpy"')
+    return np.array(rows), np.array([H for _, H in pairs])
+
+
+def own_reading(path: Any, y: Any, H: Any, x: FloatArray) -> FloatArray:
+    """Return y (p,) that a ``path`` read at x (n,), with H (p, n) or a function; raises
+    ScenarioError where that of a user's class is no reading.
+    """
+    cls = type(getattr(path, "_path", path))
+    if is_netkf_class(cls):
+        reading: FloatArray = y
+        return reading
+    given = np.asarray(y)
+    is_right = given.dtype.kind in "fiu" and given.ndim == 1
+    is_right = is_right and (callable(H) or len(given) in (0, len(H)))
+    # Of a state that has left the numbers nobody can know the reading.
+    if not is_right or (np.isfinite(x).all() and not np.isfinite(given).all()):
+        rule = f"{cls.__name__}.reading must give finite numbers, one for each row of H, or none"
+        raise ScenarioError("sensors", rule, y, "correct the class")
+    return given.astype(np.float64, copy=False)

@@ -146,3 +146,46 @@ def test_what_nobody_reads_in_bulk_is_refused(slots):
 
     with pytest.raises(netkf.NetkfError):
         netkf.simulate(slots.replace({"sensors": [Curved(nodes=(0,))]}), engine="compiled")
+
+
+class OddInSlots(SkewedInSlots):
+    give = staticmethod(lambda y: y)
+
+    def reading(self, slot, x):
+        return OddInSlots.give(self.draw(slot, x))
+
+
+class OddSamples(SkewedSamples):
+    def reading(self, k, x):
+        y, H = super().reading(k, x)
+        return OddInSlots.give(y), H
+
+
+@dataclass(frozen=True, eq=False)
+class Odd(LinearSensor):
+    def slot_path(self, node, period, generator):
+        return OddInSlots(generator("noise"), self.R)
+
+    def samples(self, node, generator, horizon):
+        return OddSamples(generator("noise"), self.R)
+
+
+NO_READINGS = {
+    "a number": lambda y: float(y[0]),
+    "a column": lambda y: y[:, None],
+    "nothing": lambda y: None,
+    "nan": lambda y: np.nan * y,
+    "too much": lambda y: np.append(y, 1.0),
+    "complex": lambda y: y + 1j,
+}
+
+
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+@pytest.mark.parametrize("name", NO_READINGS)
+def test_what_is_no_reading_is_refused_alike(slots, clocks, name, engine, monkeypatch):
+    changes = {"sensors": [Odd(nodes=(0, 4), **ONE)]}
+    monkeypatch.setattr(OddInSlots, "give", staticmethod(NO_READINGS[name]))
+    driven = slots.replace({**changes, "plant.input": INPUT})
+    for scenario in (slots.replace(changes), driven, in_clocks(clocks, Odd)):
+        with pytest.raises(netkf.ScenarioError, match=r"Odd.*\.reading must give finite numbers"):
+            netkf.simulate(scenario, engine=engine)

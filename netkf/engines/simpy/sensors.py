@@ -10,7 +10,7 @@ from netkf.engines.base import Rank
 from netkf.engines.simpy.nodes import ClockedNode
 from netkf.engines.simpy.timeline import Process, Timeline
 from netkf.linalg.arrays import FloatArray
-from netkf.plants.readings import covariance_of
+from netkf.plants.readings import covariance_of, own_reading
 from netkf.plants.sampling import Samples
 from netkf.plants.sensors import LinearSensor, SensorPath
 from netkf.rng.streams import Streams
@@ -94,7 +94,9 @@ class SamplingProcess:
         for k, time in enumerate(self.times.tolist()):
             yield timeline.at(time, Rank.SENSE, self.entity)
             # Relative to the moving origin, like the estimates.
-            y, H = self.samples.reading(k, truth.local(time))
+            x = truth.local(time)
+            y, H = self.samples.reading(k, x)
+            y = own_reading(self.samples, y, H, x)
             if up(self.node):
                 receiver.sample(self.node, y, H, covariance_of(self.samples, k, self.R))
 
