@@ -457,7 +457,7 @@ def read_many(path: Any, numbers: Sequence[int], x: FloatArray) -> tuple[FloatAr
         y, H = path.several(numbers, x)
         return y, H
     # What a user's class must have: ``reading`` of a sample gives y and H, in a slot y alone.
-    pairs = [(path.reading(k, state), k) for k, state in zip(numbers, x, strict=True)]
+    pairs: list[Any] = [(path.reading(k, state), k) for k, state in zip(numbers, x, strict=True)]
     if hasattr(path, "matrix"):
         pairs = [(y, path.matrix(k)) for y, k in pairs]
     else:
