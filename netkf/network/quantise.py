@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from netkf.core.contracts import is_netkf_class
 from netkf.core.fields import Component, field, integer, positive
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
@@ -95,7 +97,7 @@ class Encoder:
 
     def encode(self, payload: Any) -> tuple[Any, int]:
         """Return the payload that is received, and how many of its numbers were clipped: floats,
-        and arrays of them, in tuples and lists too.
+        and arrays of them, in tuples, lists, dicts and a user's dataclasses too.
         """
         if isinstance(payload, float | np.floating):
             received, count = self._encode_array(np.array(payload, dtype=np.float64))
@@ -117,7 +119,23 @@ class Encoder:
             parts = [self.encode(part) for part in payload]
             make = getattr(payload, "_make", type(payload))
             return make([part for part, _ in parts]), sum(count for _, count in parts)
-        return payload, 0
+        return self._encode_names(payload)
+
+    def _encode_names(self, payload: Any) -> tuple[Any, int]:
+        """Quantise the values of a dict or of a user's dataclass; other things stay."""
+        is_object = dataclasses.is_dataclass(payload) and not isinstance(payload, type)
+        if isinstance(payload, dict):
+            values = payload
+        elif is_object and not is_netkf_class(type(payload)):  # a model in a state is not sent
+            fields = dataclasses.fields(payload)
+            values = {one.name: getattr(payload, one.name) for one in fields if one.init}
+        else:
+            return payload, 0
+        named = {name: self.encode(value) for name, value in values.items()}
+        made: Any = {name: value for name, (value, _) in named.items()}
+        if values is not payload:
+            made = dataclasses.replace(payload, **made)
+        return made, sum(count for _, count in named.values())
 
     def _encode_field(self, values: np.ndarray, numbers: IntArray | None) -> tuple[Any, int]:
         """Quantise an array whose entries are these ``numbers``, see ``Record.numbers``."""

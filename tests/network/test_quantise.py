@@ -127,6 +127,23 @@ def test_numbers_of_any_width_are_of_few_bits():
     assert (flag, clipped) == (True, 0)
 
 
+@dataclass(frozen=True)
+class Told:
+    xhat: np.ndarray
+    about: dict
+
+
+def test_numbers_in_any_payload_of_a_user_are_of_few_bits():
+    quantisation = Quantisation(bits=5, range=4.0)
+    encoder = Encoder(quantisation, np.random.default_rng(3))
+    sent = Told(np.array([1.3, 9.0]), {"gap": 0.7, "of": (3, "x")})
+    received, clipped = encoder.encode(sent)
+    errors = np.array([received.xhat[0] - 1.3, received.about["gap"] - 0.7])
+    assert (errors != 0.0).all()
+    assert (np.abs(errors) <= 0.5 * quantisation.step).all()
+    assert (received.about["of"], clipped, sent.xhat[0]) == ((3, "x"), 1, 1.3)
+
+
 @dataclass(frozen=True, eq=False)
 class Sure(Filter):
     """Tells the same number again and again, and keeps what it hears."""
