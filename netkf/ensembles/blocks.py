@@ -7,6 +7,7 @@ import pickle
 import sys
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,9 +18,9 @@ from netkf.linalg.compiling import seconds_spent
 from netkf.runs.failures import explain_failure
 from netkf.runs.provenance import versions
 from netkf.scenario.plugins import (
+    current_module,
     find_unimportable_class,
     unguarded_line,
-    unload_namesake,
     user_components,
 )
 from netkf.scenario.scenario import Scenario
@@ -173,17 +174,18 @@ def _check_versions(required_versions: tuple[tuple[str, str], ...]) -> None:
 def _unpickle(packed: PackedScenario) -> Scenario:
     if packed.versions:
         _check_versions(packed.versions)
-    for name, folder in packed.modules:
-        # A worker may have imported another module of this name for an earlier scenario.
-        unload_namesake(name, Path(folder))
-        if folder not in sys.path:
-            sys.path.insert(0, folder)
-    try:
-        scenario: Scenario = pickle.loads(packed.payload)
-    except (AttributeError, ImportError) as error:
-        message = (
-            f"a class of the scenario cannot be imported by a worker ({describe_error(error)})"
-        )
-        remedy = "put it into a module that can be imported there, or use workers=1"
-        raise EngineError(f"{message}; {remedy}") from error
+    with ExitStack() as loaded:
+        for name, folder in packed.modules:
+            # A worker may have imported another module of this name for an earlier scenario.
+            loaded.enter_context(current_module(name, Path(folder)))
+            if folder not in sys.path:
+                sys.path.insert(0, folder)
+        try:
+            scenario: Scenario = pickle.loads(packed.payload)
+        except (AttributeError, ImportError) as error:
+            message = (
+                f"a class of the scenario cannot be imported by a worker ({describe_error(error)})"
+            )
+            remedy = "put it into a module that can be imported there, or use workers=1"
+            raise EngineError(f"{message}; {remedy}") from error
     return scenario

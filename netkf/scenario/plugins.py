@@ -16,7 +16,7 @@ import site
 import sys
 import sysconfig
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from importlib.machinery import PathFinder
@@ -231,6 +231,8 @@ def describe_failure(error: BaseException) -> str:
     return f"failed with {describe_error(error)}" + (f" ({place})" if place else "")
 
 
+_sources: dict[Path, bytes] = {}
+"""What was in the file of a module beside a scenario when it was imported last."""
 PARTS = "netkf.parts"
 """The group of entry points by which installed packages offer classes."""
 REMEDY = "add --trust if you trust its author (in Python: trust=True)"
@@ -270,9 +272,8 @@ def find_class(kind: str, origin: Origin) -> Any:
     path = [*(folder for folder in folders if folder not in sys.path), *sys.path]
 
     def load() -> Any:
-        for name in (module_name, *imports_beside(origin.folder, module_name)):
-            unload_namesake(name, origin.folder)
-        return getattr(importlib.import_module(module_name), class_name)
+        with current_module(module_name, origin.folder):
+            return getattr(importlib.import_module(module_name), class_name)
 
     return _load(kind, load, path, module_name)
 
@@ -362,11 +363,30 @@ def _import_error(kind: str, error: BaseException, target: str = "") -> Scenario
     return ScenarioError("kind", rule, kind, remedy)
 
 
-def unload_namesake(module_name: str, folder: Path) -> None:
-    """Remove a loaded module if another file of its name is in ``folder``, that of a scenario."""
-    if _is_namesake(sys.modules.get(module_name), module_name, folder):
-        del sys.modules[module_name]
-        importlib.invalidate_caches()
+@contextmanager
+def current_module(module_name: str, folder: Path) -> Iterator[None]:
+    """Within this context a module of a scenario in ``folder`` is imported as it is there, with
+    those that it imports: others of their names are removed, and all if one was edited.
+    """
+    names = module_name, *imports_beside(folder, module_name)
+    for name in names:
+        if _is_namesake(sys.modules.get(name), name, folder):
+            del sys.modules[name]
+    present = _loaded_sources(names, folder)
+    if any(_sources.get(file, text) != text for file, text in present.items()):
+        for name in names:
+            sys.modules.pop(name, None)
+    importlib.invalidate_caches()
+    yield
+    _sources.update(_loaded_sources(names, folder))
+
+
+def _loaded_sources(names: Iterable[str], folder: Path) -> dict[Path, bytes]:
+    """Return what is in the files in ``folder`` of those modules that are loaded."""
+    files = [getattr(sys.modules.get(name), "__file__", None) for name in names]
+    paths = [Path(file).resolve() for file in files if file is not None]
+    here = [path for path in paths if path.parent == folder.resolve() and path.is_file()]
+    return {path: path.read_bytes() for path in here}
 
 
 def _is_namesake(module: ModuleType | None, module_name: str, folder: Path) -> bool:

@@ -416,3 +416,21 @@ def test_what_a_class_imports_from_its_folder_comes_along(folder, tmp_path):
     digest = scenario_digest(first)
     (tmp_path / "other" / "lowest.py").write_text("EPSILON = 0.3\n")
     assert scenario_digest(first) != digest
+
+
+@pytest.mark.parametrize("edited", ["evil", "lowest"])
+def test_a_module_that_was_edited_is_imported_anew(folder, edited):
+    """A notebook went on with the classes of before, whose files the run directory has anew."""
+    texts = {
+        "evil": "from lowest import OWN\n\n\nclass P(Hybrid):\n    own = 1.0 * OWN\n",
+        "lowest": "OWN = 2.0\n",
+    }
+    for name, text in texts.items():
+        (folder / f"{name}.py").write_text("from netkf.parts import Hybrid\n" + text)
+    file = scenario(folder)
+    first, again = netkf.load(file), netkf.load(file)
+    assert type(first.filter.algorithm) is type(again.filter.algorithm)
+    changed = texts[edited].replace("1.0", "3.0").replace("2.0", "6.0")
+    (folder / f"{edited}.py").write_text("from netkf.parts import Hybrid\n" + changed)
+    assert netkf.load(file).filter.algorithm.own == 6.0
+    assert first.filter.algorithm.own == 2.0
