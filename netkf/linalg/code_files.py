@@ -120,9 +120,10 @@ class CodeFiles:
         from numba.core import serialize
 
         dumps: Any = serialize.dumps
-        constants = dumps(_constants(self._function))
+        # The function itself: its file may have been edited since it was imported.
+        made_of = dumps([_steps(self._function.__code__), *_constants(self._function)])
         texts = [part.encode() for part in [str(sig), *map(str, codegen.magic_tuple())]]
-        return _digest(*texts, self._function.__code__.co_code, constants).hex()
+        return _digest(*texts, made_of).hex()
 
     def _seal(self, index: bytes) -> bytes:
         """Return the digest of an index together with what the code was made from."""
@@ -163,6 +164,12 @@ def _constants(function: Callable[..., Any], seen: tuple[Any, ...] = ()) -> list
     return [_describe_value(value, (*seen, function)) for value in values]
 
 
+def _steps(code: CodeType) -> bytes:
+    """Return a digest of what a function does, without the lines where it says so."""
+    constants = [_steps(x) if isinstance(x, CodeType) else repr(x).encode() for x in code.co_consts]
+    return _digest(code.co_code, repr(code.co_names).encode(), *constants)
+
+
 def _names_in(code: CodeType) -> list[str]:
     """Return the names in a function's code, also of functions in it, sorted."""
     inner = (part for part in code.co_consts if isinstance(part, CodeType))
@@ -194,7 +201,7 @@ def _describe_value(value: Any, seen: tuple[Any, ...]) -> Any:
     loops = _function_of(value)
     if loops is None:
         return value
-    described: list[Any] = [loops.__module__, loops.__qualname__, loops.__code__.co_firstlineno]
+    described: list[Any] = [loops.__module__, loops.__qualname__, _steps(loops.__code__)]
     if not loops.__module__.startswith("netkf."):
         described.append(_digest(Path(inspect.getfile(loops)).read_bytes()))
     # Kernels may call themselves and each other.

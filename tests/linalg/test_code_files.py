@@ -118,6 +118,21 @@ def test_code_follows_what_a_kernel_takes_from_other_modules(tmp_path, monkeypat
     assert found == [(1116.0, 1), (1116.0, 0), *((value, 1) for value in values[1:])]
 
 
+def test_code_is_that_of_the_imported_function_not_of_its_file(tmp_path, monkeypatch):
+    """A file that is edited between import and first call left old code for the next process."""
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    monkeypatch.syspath_prepend(tmp_path)
+    text = "from netkf.kernels import kernel\n\n\n@kernel\ndef tripled(x):\n    return 3.0 * x\n"
+    (tmp_path / "tripled.py").write_text(text)
+    monkeypatch.delitem(sys.modules, "tripled", raising=False)
+    old = importlib.import_module("tripled").tripled.loops
+    (tmp_path / "tripled.py").write_text(text.replace("3.0 *", "4.0 *"))
+    assert call(old) == (9.0, 1)
+    monkeypatch.delitem(sys.modules, "tripled")
+    assert call(importlib.import_module("tripled").tripled.loops) == (12.0, 1)
+
+
 def truncate(path, planted):
     path.write_bytes(path.read_bytes()[:-7])
 
