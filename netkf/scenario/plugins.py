@@ -128,7 +128,7 @@ def imports_beside(folder: Path, name: str) -> dict[str, Path | None]:
         imported += [one.module or "" for one in nodes if isinstance(one, ast.ImportFrom)]
         for module in {full.partition(".")[0] for full in imported} - {name, *found}:
             path = folder / f"{module}.py"
-            if module in sys.stdlib_module_names:
+            if module in sys.stdlib_module_names or _is_loaded_package(module):
                 continue
             if (folder / module / "__init__.py").is_file():
                 found[module] = None
@@ -136,6 +136,15 @@ def imports_beside(folder: Path, name: str) -> dict[str, Path | None]:
                 found[module] = path
                 waiting.append(path)
     return found
+
+
+def _is_loaded_package(name: str) -> bool:
+    """Return True if ``name`` is netkf or loaded from an installed package: a file of that name in
+    a folder is not what is imported.
+    """
+    file = getattr(sys.modules.get(name), "__file__", None)
+    folders = _package_folders() if file is not None else ()
+    return name == "netkf" or any(Path(file or "").resolve().is_relative_to(one) for one in folders)
 
 
 def explain_user_error(scenario: Any, error: Exception) -> str | None:

@@ -402,11 +402,15 @@ def test_workers_import_nothing_from_the_current_folder(folder):
 def test_what_a_class_imports_from_its_folder_comes_along(folder, tmp_path):
     """A run directory has it, also a second file has its own, and a changed one is another run."""
     for place, epsilon in ((folder, 0.1), (tmp_path / "other", 0.2)):
-        module(place / "evil.py", "import json, midway\nclass P(midway.Base):\n    pass\n")
+        module(
+            place / "evil.py",
+            "import json, netkf, numpy, midway\nclass P(midway.Base):\n    pass\n",
+        )
         base = "from lowest import EPSILON\n\n\nclass Base(P):\n    own = EPSILON\n"
         module(place / "midway.py", PART + base)
         (place / "lowest.py").write_text(f"EPSILON = {epsilon}\n")
-        (place / "json.py").write_text("raise RuntimeError\n")
+        for name in ("json", "netkf", "numpy"):  # are loaded already, from elsewhere
+            (place / f"{name}.py").write_text("raise RuntimeError\n")
         first = netkf.load(scenario(place))
         assert first.filter.algorithm.own == epsilon
         assert set(find_module_files(first)) == {"evil", "midway", "lowest"}
