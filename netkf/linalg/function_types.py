@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
 import numba
@@ -11,18 +10,16 @@ from numba import types
 from numba.extending import lower_builtin, type_callable
 
 from netkf.linalg.addresses import call_at, call_at_two, number_at
-from netkf.linalg.compiling import compile_c_function
 from netkf.linalg.functions import call_function
 from netkf.linalg.struct_types import StructType
 
 _numba: Any = numba
 carray, _POINTER = _numba.carray, _numba.types.CPointer(types.float64)
-_SIGNATURE = types.void(_POINTER, _POINTER, types.float64, types.float64, _POINTER)
+SIGNATURE = types.void(_POINTER, _POINTER, types.float64, types.float64, _POINTER)
 
 
-@lru_cache
-def compile_function(function: Any, shapes: tuple[Any, Any, Any], takes_period: bool) -> Any:
-    """Return the C function of a kernel, see ``VectorFunction``."""
+def taking_addresses(function: Any, shapes: tuple[Any, Any, Any], takes_period: bool) -> Any:
+    """Return what the C function of a kernel is made of, see ``VectorFunction``."""
     of_x, of_u, of_out = shapes
 
     def call(x: Any, u: Any, t: Any, period: Any, out: Any) -> None:
@@ -31,8 +28,7 @@ def compile_function(function: Any, shapes: tuple[Any, Any, Any], takes_period: 
     def call_shortly(x: Any, u: Any, t: Any, _period: Any, out: Any) -> None:
         function(carray(x, of_x), carray(u, of_u), t, carray(out, of_out))
 
-    made = call if takes_period else call_shortly
-    return compile_c_function(made, _SIGNATURE, {"error_model": "numpy"})
+    return call if takes_period else call_shortly
 
 
 @type_callable(call_function)

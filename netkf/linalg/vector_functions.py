@@ -5,13 +5,13 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray, real_numbers
-from netkf.linalg.compiling import require_numba, require_quiet
+from netkf.linalg.compiling import compile_c_function, require_numba, require_quiet
 from netkf.linalg.functions import plain_address
 from netkf.linalg.plain import is_plain
 
@@ -51,11 +51,8 @@ class VectorFunction:
             self._code = _CALL(self._call_with_addresses)
             return int(ctypes.cast(self._code, ctypes.c_void_p).value or 0)
         require_numba()
-        from netkf.linalg.function_types import compile_function
-
         require_quiet(getattr(self._function, "loops", self._function), set())
-
-        self._code = compile_function(self._function, self._shapes, self._takes_period)
+        self._code = _compile(self._function, self._shapes, self._takes_period)
         return int(self._code.address)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -109,3 +106,12 @@ class VectorFunction:
             memory: Any = (ctypes.c_double * math.prod(shape)).from_address(address)
             self._arrays[key] = np.frombuffer(memory).reshape(shape)
         return self._arrays[key]
+
+
+@lru_cache
+def _compile(function: Any, shapes: tuple[Any, Any, Any], takes_period: bool) -> Any:
+    """Return the C function of a kernel, with numba loaded."""
+    from netkf.linalg.function_types import SIGNATURE, taking_addresses
+
+    made = taking_addresses(function, shapes, takes_period)
+    return compile_c_function(made, SIGNATURE, {"error_model": "numpy"})
