@@ -601,6 +601,8 @@ class SourceFile:
     node_ids  the ids of nodes by name, None before a graph is known
     unknown   names in the file that were read before that, with the number -1, -2, ... that stands
               for each until then
+    content   what the file had when the scenario was made, for the copy beside its results; None in
+              a worker
     """
 
     name: str
@@ -608,6 +610,11 @@ class SourceFile:
     stamps: TimeBase = TimeBase()
     node_ids: Mapping[str, int] | None = dataclasses.field(default=None, compare=False)
     unknown: dict[str, int] = dataclasses.field(default_factory=dict, compare=False)
+    content: bytes | None = dataclasses.field(default=None, compare=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a worker needs."""
+        return self.__dict__ | {"content": None}
 
     def __repr__(self) -> str:
         return repr(self.name)
@@ -616,6 +623,10 @@ class SourceFile:
     def full(self) -> Path:
         """Path of the file, absolute or relative to the current folder."""
         return self.folder / self.name
+
+    def read_bytes(self) -> bytes:
+        """Return what the file had when the scenario was made; raises OSError."""
+        return self.full.read_bytes() if self.content is None else self.content
 
 
 def _convert_source_file(value: Any) -> SourceFile:
@@ -640,9 +651,10 @@ def _convert_source_file(value: Any) -> SourceFile:
             raise _SpecificError("must stay inside the folder of the scenario file")
         if not source.full.is_file():
             raise _SpecificError(f"no such file in {source.folder}")
+        content = source.full.read_bytes()
     except (OSError, RuntimeError) as error:  # a loop of links, a name that is too long
         raise _SpecificError("must be the path of a file that can be read") from error
-    return dataclasses.replace(source, name=name)
+    return dataclasses.replace(source, name=name, content=content)
 
 
 def as_path(name: str, value: object, remedy: str = "give it as text or a pathlib.Path") -> Path:

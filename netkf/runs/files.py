@@ -9,7 +9,6 @@ import json
 import math
 import os
 import platform
-import shutil
 import stat
 import sys
 import tempfile
@@ -20,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from netkf.core.errors import ScenarioError, WriteError
-from netkf.core.fields import as_path
+from netkf.core.fields import SourceFile, as_path
 from netkf.scenario.plugins import find_module_files, find_unimportable_class
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import source_files
@@ -253,7 +252,7 @@ def write_scenario(
 ) -> None:
     """Write scenario.toml, with all defaults if ``resolve``, its files and modules (WriteError)."""
     for source in source_files(scenario):
-        copy_file(source.full, directory / source.name)
+        copy_file(source, directory / source.name)
     for module in find_module_files(scenario).values():
         if module is not None:
             copy_file(module, directory / module.name)
@@ -262,20 +261,21 @@ def write_scenario(
     write_text(directory / "scenario.toml", to_toml(table))
 
 
-def copy_file(source: Path, target: Path) -> None:
-    """Copy the file ``source`` to ``target`` atomically."""
-    if target.is_file() and target.read_bytes() == source.read_bytes():
+def copy_file(source: Path | SourceFile, target: Path) -> None:
+    """Copy the file ``source`` to ``target`` atomically, one of a scenario as it was read."""
+    content = source.read_bytes()
+    if target.is_file() and target.read_bytes() == content:
         return
     with writing_file(target):
         target.parent.mkdir(parents=True, exist_ok=True)
     with write_atomically(target) as temporary:
-        shutil.copyfile(source, temporary)
+        temporary.write_bytes(content)
 
 
 def scenario_digest(scenario: Scenario, **changed: Any) -> str:
     """Return the SHA-256 of a scenario with all defaults, or ``changed`` keys, and its files."""
     digest = hashlib.sha256(to_toml(resolve_defaults(scenario) | changed).encode())
-    files = {source.name: source.full for source in source_files(scenario)}
+    files: dict[str, Path | SourceFile] = {one.name: one for one in source_files(scenario)}
     files |= {f"{name}.py": file for name, file in find_module_files(scenario).items() if file}
     for name, file in sorted(files.items()):
         digest.update(name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())

@@ -1,6 +1,7 @@
 """What manifests say about how a run came about."""
 
 import json
+import pickle
 
 import numpy as np
 import pandas as pd
@@ -26,6 +27,23 @@ def test_a_manifest_lists_what_decides_the_last_bit(ring, tmp_path):
     assert found["versions"]["numpy"] == np.__version__
     assert found["machine"]["architecture"]
     assert found["machine"]["vector_instructions"]
+
+
+@pytest.mark.parametrize("after", ["5.0\n", None])
+def test_a_table_that_was_edited_meanwhile_is_kept_as_it_was_read(ring, tmp_path, after):
+    """The run directory had the table of the time of saving, of another run than that in it."""
+    (tmp_path / "u.csv").write_text("t,u0\n0,1.0\n")
+    recorded = {"kind": "recorded", "path": tmp_path / "u.csv", "G": [[1.0]] * ring.plant.n}
+    scenario = ring.replace({"plant.input": recorded, "horizon": 1.0})
+    if after is None:
+        (tmp_path / "u.csv").unlink()
+    else:
+        (tmp_path / "u.csv").write_text(f"t,u0\n0,{after}")
+    run = netkf.simulate(scenario)
+    save(run, scenario, tmp_path / "out")
+    again = netkf.simulate(netkf.load(tmp_path / "out" / "scenario.toml"))
+    np.testing.assert_array_equal(again.xhat, run.xhat)
+    assert b"0,1.0" not in pickle.dumps(scenario)  # workers read nothing
 
 
 def test_what_the_engine_counted_is_kept(ring, tmp_path):
