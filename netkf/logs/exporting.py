@@ -55,8 +55,8 @@ def export_recorded(run: Run, out: str | Path) -> tuple[Path, ...]:
         for block in table.get("plants", []):
             block.pop("position", None)
     text = to_toml(table)
-    given = {source.name: source.full for source in source_files(scenario)}
-    files |= {name: path for name, path in given.items() if f'"{name}"' in text}
+    given = {source.name: source for source in source_files(scenario)}
+    files |= {name: source for name, source in given.items() if f'"{name}"' in text}
     files["scenario.toml"] = text
     write_folder(folder, files)
     return tuple(folder / name for name in files)
@@ -196,7 +196,7 @@ def export_log(run: Run, out: str | Path) -> tuple[Path, ...]:
         if activation.at != "nodes":
             ticks["peer"] = [names[i] for i in rows["peer"].tolist()]
         files["ticks.csv"] = ticks.to_csv(index=False)
-    files |= {source.name: source.full for source in source_files(scenario)}
+    files |= {source.name: source for source in source_files(scenario)}
     files["scenario.toml"] = to_toml({**resolve_defaults(scenario), "seed": run.seed})
     write_folder(folder, files)
     return tuple(folder / name for name in files)

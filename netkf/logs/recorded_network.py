@@ -12,6 +12,7 @@ import pandas as pd
 
 from netkf.core.csv_files import is_number_text
 from netkf.core.errors import ScenarioError
+from netkf.core.fields import SourceFile
 from netkf.core.printable import MAX_NAME, count_phrase
 from netkf.core.stamps import TimeBase
 from netkf.logs.packets import PacketLog, accounts, note_count, settle
@@ -24,7 +25,7 @@ from netkf.scenario.writing import resolve_defaults, to_toml, toml_text
 LAG = 10
 """Readings between the two of a pair whose differences tell how the state moves."""
 TABLES = ("outcomes.csv", "unknown.csv", "accounts.csv", "delays.csv")
-Files = dict[str, str | Path]
+Files = dict[str, str | Path | SourceFile]
 """Texts, or files to copy, by name."""
 
 HEAD = """\
@@ -315,10 +316,10 @@ def _scenario_like(
         )
     for source in source_files(scenario):
         if source not in replaced:
-            if source.name in TABLES or files.get(source.name, source.full) != source.full:
+            if source.name in TABLES or files.get(source.name, source) != source:
                 rule = "the scenario names a table as import does"
                 raise ScenarioError("path", rule, source.name, "rename the table")
-            files[source.name] = source.full
+            files[source.name] = source
     files["scenario.toml"] = to_toml(resolved)
     return files
 
