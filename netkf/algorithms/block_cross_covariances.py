@@ -131,7 +131,9 @@ def predict(record: Any, h: int, run: Any) -> None:
 
 @kernel
 def update(record: Any, h: int, run: Any) -> None:
-    """Use the readings of the node's own block; those of pairs wait for this instant's exchange."""
+    """Use the readings of the node's own block; those of pairs are kept for the exchange of this
+    instant.
+    """
     f = record.fusion
     for q in range(len(run.lanes)):
         f.x[:], f.P[:] = 0.0, 0.0
@@ -192,7 +194,9 @@ def write_message(record: Any, h: int, m: int, run: Any, w: int) -> None:
 
 @kernel
 def absorb(record: Any, h: int, run: Any) -> None:
-    """Use the messages of this instant in turn, by sender, but for those that took time."""
+    """Use the messages of this instant one after the other, by sender; one that took time is used
+    for nothing.
+    """
     for q in range(len(run.lanes)):
         met, n = False, len(run.size)
         for i in range(n):
@@ -539,7 +543,8 @@ class BlockCrossCovariances(Filter):
     approximated as if the readings of a pair had been own ones, and nothing is proved of P: the
     more pairs have nodes in common the more overconfident it is, most where they exchange at once,
     as pairs of one step do, and under clocks all of one instant. Both nodes are updated if both
-    transmit at the instant of the readings. A message that took time is used for nothing.
+    transmit at the instant of the readings; one that hears nothing then is not. A message that took
+    time is used for nothing.
     """
 
     steps: int = field(integer(low=1, high=MAX_STEPS), default=8)

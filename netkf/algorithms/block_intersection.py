@@ -68,7 +68,9 @@ def add_covariance(
 
 @kernel
 def predict(record: Any, h: int, run: Any) -> None:
-    """Predict node ``h``; the noise is independent of others, if nobody shares its blocks."""
+    """Predict node ``h``. The plant's noise is independent of others, if nobody else estimates the
+    same blocks.
+    """
     lanes, n, dependent = run.lanes, len(run.size), record.dependent
     if record.rule == SPLIT:
         Phi, moved = run.noise, run.moved

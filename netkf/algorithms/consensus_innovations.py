@@ -239,7 +239,9 @@ gain_sequence = cached_by_entries(8)(GainSequence)
 
 @kernel
 def predict(record: Any, h: int, run: Any) -> None:
-    """Predict state and pseudo-state of node ``h``; the root follows from the gains."""
+    """Predict the estimates of node ``h``, of the pseudo-state and of the state; the root follows
+    from the gains.
+    """
     lanes, x, y, F, inverse = run.lanes, record.xhat, record.pseudo, run.model.F, record.inverse
     # y - G x, of which G^+ is a difference of states.
     write_matvec(run, record.G, x, h, run.gains)

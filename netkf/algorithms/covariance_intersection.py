@@ -31,7 +31,8 @@ class CovarianceIntersection(Hybrid):
     for each neighbour heard and the rest for the node itself.
 
     P after a reset is at most that of the convex reset, and the Riccati equation keeps that order,
-    so the bound of paper H (12) on E[P_i] holds here too; and so does paper H (10).
+    so the bound of paper H (12) on E[P_i] holds here too; and P_i stays at least the covariance of
+    the error, paper H (10).
     """
 
     needs = Needs(inverts=True)

@@ -103,7 +103,8 @@ def begin_diffusion(_: Any, node: Mapping[str, np.ndarray], info: NodeInfo, _mod
 @built_in("diffusion")
 @dataclass(frozen=True, eq=False)
 class DiffusionFilter(WeightedFilter):
-    """Xie, Gan and Liu, D Algorithm 1, (6)-(9), with any F; samples in slots are predictions.
+    """Xie, Gan and Liu, D Algorithm 1, (6)-(9), with any F in place of the identity; samples in
+    slots are predictions.
 
     Under clocks a node combines its estimate with those that it heard at one instant; those of
     delayed messages are predicted to now first.

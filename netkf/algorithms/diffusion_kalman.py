@@ -34,7 +34,8 @@ def emit(record: Any, h: int, m: int, run: Any) -> None:
 @kernel
 def absorb(record: Any, h: int, run: Any) -> None:
     """Use the readings heard, step 1 of Algorithm 1, or form the weighted mean of estimates, step
-    2: ``xhat_i = psi_i + sum_l c_{l,i} (psi_l - psi_i)``: equal estimates stay to the last bit.
+    2: ``xhat_i = psi_i + sum_l c_{l,i} (psi_l - psi_i)``, so that equal estimates stay to the last
+    bit.
     """
     if run.phase == READINGS:
         use_readings_heard(record, h, run)

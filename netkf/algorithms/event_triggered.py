@@ -36,7 +36,9 @@ from netkf.linalg.lanes import any_lane, load, load_flags, select, spread, store
 
 @kernel
 def predict(record: Any, h: int, run: Any) -> None:
-    """Predict node ``h``, and the copies of estimates as their senders do, to stay the same."""
+    """Predict node ``h``, and the copies of estimates as their senders do: so they stay the same at
+    both ends.
+    """
     predict_estimate(run.model, run, record.xhat, record.root, h, h)
     if any_lane(load_flags(run.lanes, record.has_sent, h)):
         predict_copy(run.model, run, record.sent_x, record.sent_root, h)

@@ -34,13 +34,16 @@ class Model(Protocol):
 
     @property
     def information(self) -> FloatArray:
-        """``H' R^-1 H`` (n, n) of the node's sensors, per second or per slot."""
+        """The information ``H' R^-1 H`` (n, n) that the node's sensors give, per second or per
+        slot.
+        """
 
     def predict(
         self, xhat: FloatArray, root: FloatArray, gap: float
     ) -> tuple[FloatArray, FloatArray]:
         """Return estimate (n,) and root (n, n) of its covariance ``gap`` seconds later, from
-        ``xhat`` (n,) and ``root`` (n, n) now; the root counts readings of the gap already.
+        ``xhat`` (n,) and ``root`` (n, n) now. With increment sensors the root counts the readings
+        of the gap already.
         """
 
     def extrapolate(
@@ -54,11 +57,14 @@ class Model(Protocol):
         self, xhat: FloatArray, root: FloatArray, moments: FloatArray, gap: float
     ) -> FloatArray:
         """Return the estimate (n,) after the increments of the last ``gap`` seconds with these
-        ``moments`` (2 p,), from ``xhat`` (n,) and ``root`` (n, n) predicted to its end.
+        ``moments`` (2 p,), from the prediction ``xhat`` (n,) and the ``root`` (n, n) at the end of
+        the gap.
         """
 
     def max_interval(self, root: FloatArray) -> float:
-        """Return the seconds of increments usable at once, for this root (n, n) of P."""
+        """Return the seconds of increments that may be used at once if the covariance has this root
+        (n, n).
+        """
 
 
 class NetworkInfo(NamedTuple):
@@ -152,7 +158,9 @@ class Exchange(NamedTuple):
 
 
 class Message(NamedTuple):
-    """A message that arrived: sender, weight, payload, and age in seconds."""
+    """A message that arrived: its sender, the weight it is given, its payload, and its age in
+    seconds.
+    """
 
     sender: int
     weight: float
@@ -166,7 +174,8 @@ class PairReading(NamedTuple):
     other : name and owner (id) of the latter, -1 if all share it
     y, R : values (p,), and their noise covariance (p, p)
     H : ``H(x, x_other)`` returns y linearised at the estimates x (n,) of the node and x_other (n',)
-        of the other: z (p,), and H (p, n), H_other (p, n') with ``z = H x + H_other x_other + v``
+        of the other block: z (p,), and H (p, n) and H_other (p, n') with ``z = H x + H_other
+        x_other + v``
     """
 
     other: Key
@@ -216,7 +225,9 @@ class State(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """The usual payload: the estimate ``xhat`` (n,) and the ``root`` (n, n) of its covariance."""
+    """The usual payload: the sender's estimate ``xhat`` (n,) and the ``root`` (n, n) of its
+    covariance.
+    """
 
     xhat: FloatArray
     root: FloatArray
@@ -338,7 +349,8 @@ class Filter(Component):
 
     def emit(self, state: Any, exchange: Exchange) -> tuple[Any, Any]:
         """Return the state after sending and the payload for all ``exchange.receivers`` (in slots:
-        of this step); a payload of None sends nothing. By default it is ``xhat`` and ``root``.
+        of this step); a payload of None sends nothing. By default the payload is ``xhat`` (n,) and
+        ``root`` (n, n).
         """
         if self.kernels is not None:
             return single.emit(state, exchange)
@@ -354,11 +366,14 @@ class Filter(Component):
         return single.absorb(state, messages, exchange)
 
     def estimate(self, state: Any) -> tuple[FloatArray, FloatArray | None]:
-        """Return ``xhat`` (n,) and its covariance ``P`` (n, n) now; P is None if there is none."""
+        """Return the estimate ``xhat`` (n,) and its covariance ``P`` (n, n) now; P is None if the
+        filter has none.
+        """
         return state.xhat, state.root @ state.root.T
 
     def shift(self, state: Any, offset: FloatArray) -> Any:
-        """Return a state, or a payload under way, with ``offset`` (n,) added to the estimate.
+        """Return a state, or a payload under way, with ``offset`` (n,) added to the estimate and to
+        everything like one.
 
         Engines call it when they move the origin of coordinates near to the true state, so that
         errors on unstable plants keep their digits; of a payload ``offset`` is the move at the time

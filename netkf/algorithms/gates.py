@@ -35,7 +35,8 @@ class Gate(Component):
 
     def refused_spread(self, p: int) -> float:
         """Return g with E[z z'] = g S for healthy innovations z of p numbers that are refused:
-        after one of them that is ignored, by a gain K, P of the error is P + (g - 1) K S K'.
+        after one of them that is ignored, of a filter whose gain would be K, the covariance of the
+        error is P + (g - 1) K S K'.
 
         The integral of a Gaussian law over the outside of an ellipsoid: by symmetry E[z z'] is
         proportional to S, and the factor E[u; u > c] / p of a chi-square number u is the tail of

@@ -199,7 +199,8 @@ class Hcmci(InformationConsensus):
 
     def recipe(self, nodes: int) -> Recipe:
         """Return the recipe for a network of N ``nodes`` and the variant that was chosen: from
-        which shares of prediction and reading the pairs begin, and how often each counts.
+        which shares of prediction and reading the pairs begin, and how often each counts in the
+        estimate.
         """
         omega = float(nodes) if self.novelty_weight is None else self.novelty_weight
         # Rows: shares of prediction and reading in a pair; then how often each pair counts, and the

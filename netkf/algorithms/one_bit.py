@@ -125,7 +125,8 @@ class OneBit(Filter):
     for the sign b of a row h of H with noise variance r.
 
     It is the paper's filter if all nodes receive all bits. A node that misses some continues with
-    another estimate, to which later bits do not refer. Own readings enter as bits too.
+    another estimate, to which later bits do not refer. Readings enter as bits only, also the
+    node's own.
     """
 
     analysis = Analysis(paper="one_bit", payload_numbers=lambda _, rows, __: rows / 64.0)

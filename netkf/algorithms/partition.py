@@ -606,7 +606,8 @@ class Partition(Filter):
     grows. Before it has heard of a block, and wherever the bound has become worse than that, it
     has what was known at the start, predicted. What two nodes both estimate, and readings of blocks
     of the node and of one other owner, are used by covariance intersection. P is never below the
-    covariance of the error. Late messages are predicted with what the sender has of others.
+    covariance of the error. Messages that took time are predicted to the present with what the
+    sender has of other blocks.
     """
 
     needs = Needs(

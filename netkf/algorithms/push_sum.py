@@ -121,7 +121,9 @@ def emit(record: Any, h: int, m: int, run: Any) -> None:
 
 @kernel
 def absorb(record: Any, h: int, run: Any) -> None:
-    """Average estimates, step 5.2, or take in mass and learn the network from it, 2.2, 2.3."""
+    """Average estimates, step 5.2, or take in mass and learn from it what the network is, steps 2.2
+    and 2.3.
+    """
     if run.phase == AVERAGE:
         average(record, h, run)
     elif record.asymptotic == 0:

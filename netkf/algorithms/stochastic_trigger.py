@@ -469,7 +469,9 @@ class StochasticTrigger(Filter):
 
     @cached_property
     def wrapped(self) -> Filter:
-        """The filter that runs: ``inner`` with a trigger, or one that uses silence."""
+        """The filter that runs: one that uses silence if ``inner`` is "intermittent", else
+        ``inner`` with a trigger.
+        """
         if type(self.inner) is Intermittent:
             return ScheduledReadings(self.Y)
         return TriggeredMessages(self.Y, self.inner)

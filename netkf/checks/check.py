@@ -379,7 +379,8 @@ def check(
 
     The state is sampled at the times that the promises need, whatever ``probe`` says. A user's
     class is held to the promises of the filter that it derives from. ``workers``, ``executor``,
-    ``scheduler`` and ``progress`` are those of ``netkf.monte_carlo``, whatever the verdict.
+    ``scheduler`` and ``progress`` are those of ``netkf.monte_carlo``; they do not change the
+    verdict.
 
     With ``until = "decided"`` runs are added until every row is decided, a promise is broken or
     ``most`` runs are done. Runs can also be added to an ``earlier`` verdict on the same scenario

@@ -32,7 +32,8 @@ FIRST_BLOCK, MAX_BLOCK = 8, 1 << 16
 class Clock(Component):
     """The contract of a clock: a stateless generator of increasing tick times in seconds, all > 0.
 
-    The caller owns each entity's generator: its ticks depend on nothing but its own stream.
+    The caller owns the random generator of each entity, so that the ticks of an entity depend on
+    nothing but its own stream.
     """
 
     _values = MappingProxyType(

@@ -26,7 +26,8 @@ class WaitingLaw(NamedTuple):
 
 class Lattice(NamedTuple):
     """Ticks at ``first + k period`` seconds, k = 0, 1, ..., each late by a time that is uniform in
-    [0, ``jitter``). With ``random_phase`` all ticks are late by a time in [0, ``period``).
+    [0, ``jitter``). With ``random_phase`` all ticks of a clock are late by one more time, uniform
+    in [0, ``period``).
     """
 
     period: float

@@ -64,7 +64,8 @@ def plot(result: Any, figure: str = "error") -> Picture:
 
     Of several runs and ensembles, in a list or by their labels in a mapping, it is ``error``: the
     mean square errors of all of them over time. If the result lacks the data of that figure, it
-    shows a sentence that says so. Raises ScenarioError for an unknown name or another ``result``.
+    shows a sentence that says so. Raises ScenarioError for an unknown name, and if ``result`` is
+    not a result.
     """
     return FigureSet(result).draw(figure)
 

@@ -98,7 +98,9 @@ def _neighbours(lanes: Lanes, array: np.ndarray, place: tuple[int, ...]) -> Any:
 
 
 def load(lanes: Lanes, array: FloatArray, *place: int) -> Any:
-    """Return ``array[place]`` (L,) as one value of L lanes; ``place``: all indices but the last."""
+    """Return ``array[place]`` (L,) as one value of L lanes; ``place`` are the indices of all axes
+    but the last.
+    """
     if len(lanes) == 1:
         return array[place + (0,) * (array.ndim - len(place))]
     return _neighbours(lanes, array, place).view(Row).copy()
@@ -138,7 +140,9 @@ def scatter(
 
 
 def store(lanes: Lanes, array: FloatArray, *place_and_value: Any) -> None:
-    """Write a value of L lanes, the last argument, or a float, into ``array[place]`` (L,)."""
+    """Write a value of L lanes, the last argument, into ``array[place]`` (L,); a float into all
+    lanes.
+    """
     *place, value = place_and_value
     _neighbours(lanes, array, tuple(place))[:] = value
 

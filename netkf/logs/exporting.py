@@ -34,7 +34,8 @@ def export_recorded(run: Run, out: str | Path) -> tuple[Path, ...]:
     ``scenario.toml`` is that of the run with what happened in place of its causes: which messages
     were lost (``losses.csv``) and how long the others took (``delays.csv``), when nodes were down
     (``lives.csv``), and where nodes were that their states placed (``positions.csv``). It has no
-    radios, hops and shared losses. With the same seed and replica it is the same run.
+    radios, hops and shared losses. With the same seed and replica its events and states are those
+    of the run.
 
     Raises ScenarioError for a run without a scenario, TheoryError where the messages of the last
     slot cannot be told, and WriteError.

@@ -46,7 +46,8 @@ def import_log(
     what the tables call a column: {"t_ms": "stamp", "sender": "origin"}. With ``trust`` classes
     that the scenario names are imported, as by ``netkf.load``.
 
-    Raises ScenarioError with file and line before anything is written, and WriteError.
+    Raises ScenarioError with file and line for a log that cannot be read, before anything is
+    written, and WriteError.
     """
     folder, log = as_path("out", out), as_path("log", log)
     for key, value, known in (("kind", kind, KINDS), ("unreported", unreported, UNREPORTED)):

@@ -140,7 +140,8 @@ def _means(ensemble: Ensemble) -> Variables:
 
 def export_netcdf(result: Run | Ensemble, out: str | Path) -> tuple[Path, ...]:
     """Write ``to_xarray()`` of a run or an ensemble as a netCDF file, and return its path: ``out``
-    or, if that is a folder, ``out``/run.nc or ensemble.nc, which ``xarray.load_dataset`` returns.
+    or, if that is a folder, ``out``/run.nc or ensemble.nc. ``xarray.load_dataset`` returns the same
+    Dataset, to the bit.
 
     Raises ScenarioError without the extra ``xarray``, and WriteError.
     """

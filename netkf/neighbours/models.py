@@ -37,7 +37,8 @@ def from_control(
     (m, m) of w, in continuous time its intensity; ``G=system.B`` is noise at the inputs, as
     ``control.lqe(system, Q, R)`` has it. ``R`` (p, p) is the covariance, or the intensity, of the
     noise of the outputs; by default both are identities, since a state space has no noise. If R is
-    diagonal, node k reads output k, else node 0 reads all. States are named as there.
+    diagonal, node k reads output k, else node 0 reads all of them. States have the names that
+    python-control has for them.
 
     The network is complete, and the filter ``central``, the Kalman filter of all readings.
     ``changes`` are values by key, as in ``netkf.load``, for what a state space does not say:

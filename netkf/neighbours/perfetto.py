@@ -36,7 +36,8 @@ def export_perfetto(
 
     Each node is a process. Its track ``events`` has a slice for each instant at which something
     happens, named after the kinds of its events; its width means nothing. Messages that arrive are
-    arrows (flows) between slices; trace P and norm of error are counters. Rounded to nanoseconds.
+    arrows (flows) between slices; trace P and norm of error are counters. Instants are rounded to
+    nanoseconds.
 
     Raises ScenarioError for a window in which there is nothing, and WriteError.
     """

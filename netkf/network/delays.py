@@ -76,7 +76,9 @@ class Delay(Component):
 
     @property
     def law(self) -> WaitingLaw | None:
-        """The law of independent delays (s); None if constant, or unknown before a run."""
+        """The law of the delays of independent messages in seconds; None if it is constant, or
+        unknown before a run.
+        """
         return None
 
     def message_delay(self, sent: Transmission, drawn: Any) -> Any:

@@ -101,7 +101,9 @@ class Topology:
         return self.nodes[self.index[node]]
 
     def find(self, name: str) -> int | None:
-        """Return the id of the node with a name, maybe an id as text; None if there is none."""
+        """Return the id of the node with a name, which may be an id as text; None if no node has
+        it.
+        """
         node = self.names.get(name, _as_integer(name))
         return self.named(node) if node in self.index else None
 
@@ -535,7 +537,9 @@ class RangeGraph(Graph):
     radius: float = field(positive)
 
     def build(self, seed: int) -> Topology:
-        """Return the topology that links all pairs, whatever the ``seed``; raises ScenarioError."""
+        """Return the topology that links all pairs; ``seed`` is not used. Raises ScenarioError
+        without nodes.
+        """
         if not self.nodes:
             remedy = "add nodes = N, or network.positions"
             raise ScenarioError("nodes", "is missing, and nothing is placed", None, remedy)
@@ -651,7 +655,8 @@ class CsvGraph(Graph):
     is undirected; nodes without a link are left out, and a note names them. If the table of an
     undirected graph lists every link once, each row counts in both directions. If it lists only
     some links in both directions, the other probabilities are unknown, and the table is refused
-    unless ``minimum`` drops those links. ``positions``: a table that begins with node, x and y.
+    unless ``minimum`` drops those links. ``positions`` is a table whose first three columns are
+    node, x and y.
     """
 
     may_name_nodes: ClassVar[bool] = True

@@ -121,7 +121,9 @@ class Loss(Component):
 
     @property
     def state_of(self) -> str:
-        """Whose the two states are: each "link" has its own, or each "sender" for its links."""
+        """Whose the two states are: each "link" has its own, or each "sender", all of whose links
+        are in one state.
+        """
         return "link"
 
     def next_state(self, link: Link, bad: bool | None, random: np.random.Generator) -> bool:
@@ -424,7 +426,9 @@ class GilbertElliott(Loss):
         return self._table[0].get(link, self)
 
     def check(self, topology: Topology) -> None:
-        """Raise ScenarioError unless each row is of a link, and each link has a chain."""
+        """Raise ScenarioError unless every row of the table is of a link, and every link has a
+        chain.
+        """
         chains, table, _ = self._table
         if table is None:
             return

@@ -247,7 +247,8 @@ class RecordedSlots(SlotActivation):
     """Exchanges read from a table.
 
     Columns ``slot,node,peer`` are the pairs of matchings. Columns ``slot,phase,step,node,peer`` are
-    the links of broadcasts that were up, from node to peer, both ways if the graph is undirected.
+    the links of broadcasts that were up, from node to peer, and in both directions if the graph is
+    undirected.
     """
 
     path: SourceFile = field(source_file)

@@ -120,7 +120,8 @@ class _Recorded(Component):
 class RecordedLoss(_Recorded, Loss):
     """Outcomes read from a table ``sender,receiver,message,delivered`` (0 or 1).
 
-    Messages of a directed link are counted from 0; ``after``: the treatment of others.
+    Messages of a directed link are counted from 0; ``after`` is the treatment of a message that is
+    not listed.
     """
 
     independent = False

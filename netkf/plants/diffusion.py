@@ -153,7 +153,8 @@ class Diffusion(Plant):
     ) -> SampledTruth:
         """Return a path without a sensing grid, which has states at ``times`` (K,) in seconds, all
         below the ``horizon``, and at frame times. A state depends on its time only: ``random``
-        draws x(0), and names the streams of all else. With ``frames`` states are relative to these.
+        draws x(0), and names the streams of all else. With ``frames`` states are relative to the
+        origin of their frame.
         """
         stream = state_of(random)
         start = self.start(random)

@@ -224,7 +224,9 @@ class RecordedInput(Input):
 
     @cached_property
     def exogenous(self) -> Exogenous:
-        """The system whose output u jumps at the rows; raises ScenarioError for two at one time."""
+        """The system whose output is u, which jumps at the rows; raises ScenarioError for two
+        values at one time.
+        """
         u = self._table[1]
         rule = "there may be one row a time, or equal ones"
         first = first_rows(self.columns, self.row_keys, u.tolist(), rule)

@@ -183,7 +183,9 @@ class NonlinearSensor(Sensor):
         """Raise ScenarioError if the sensor cannot read a state of n components."""
 
     def support(self, n: int, node: int) -> np.ndarray:
-        """Return the entries (k,) of ``n`` that readings on ``node`` (id) depend on, here all."""
+        """Return the entries (k,) of a state of ``n`` that readings on ``node`` (id) depend on: by
+        default all.
+        """
         return np.arange(n)
 
     def located(self, positions: dict[int, tuple[float, float]] | None) -> NonlinearSensor:

@@ -117,7 +117,9 @@ class RelativeSensor(Sensor):
     def lowered(
         self, layout: Layout, pairs: Sequence[tuple[Place, Place]]
     ) -> list[LinearSensor | RecordedSensor]:
-        """Return the stacked state's sensors that stand for it, of ``pairs``, the reader first."""
+        """Return the sensors of the stacked state that stand for it, of ``pairs`` of blocks, that
+        of the reader first.
+        """
         matrices = {
             (own.node, other.node): layout.embed([(own, -H), (other, H)])
             for own, other in pairs

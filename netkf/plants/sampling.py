@@ -83,7 +83,9 @@ class RecordedSampling(Clock):
     def ticks(
         self, entity: Entity, origin: float, index: int, now: float, random: Generator, count: int
     ) -> FloatArray:
-        """Return ``count`` or fewer recorded times of ``entity[0]``, from number ``index`` on."""
+        """Return up to ``count`` recorded times of the node ``entity[0]``, from number ``index``
+        on.
+        """
         return self._times.get(entity[0], np.empty(0))[index : index + count]
 
 

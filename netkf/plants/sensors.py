@@ -78,7 +78,9 @@ class Sensor(Component):
         return None
 
     def matrix_of(self, n: int) -> FloatArray:
-        """Return H (p, n) of the first reading, of which filters' models are made before a run."""
+        """Return H (p, n) of the first reading, for a state of n components; the filters' models
+        are made with it before a run.
+        """
         H: FloatArray = self.H  # type: ignore[attr-defined]
         return H
 
@@ -133,7 +135,9 @@ class LinearSensor(Sensor):
         return DrawnSamples(self.H, self.R, generator("noise"))
 
     def path(self, random: np.random.Generator, cutting: np.random.Generator) -> SensorPath:
-        """Return a run's increments: ``random`` draws noise on the grid, ``cutting`` inside it."""
+        """Return the increments of one run: ``random`` draws noise on the grid, ``cutting`` inside
+        it.
+        """
         return SensorPath(self.H, self.R, random, cutting)
 
     def slot_path(self, node: int, period: float, generator: Generators) -> SlotReadings:

@@ -110,12 +110,14 @@ def run_to_directory(
 
 
 def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
-    """Write a simulated run to a new or empty directory, as ``netkf run`` does; return its path.
+    """Write a simulated run to a new or empty directory, as ``netkf run`` does, and return its
+    path.
 
     The files are scenario.toml, manifest.json, the Parquet tables and summary.json. scenario.toml
     has the seed of the run, so that simulating it again gives the same files for replica 0.
 
-    Raises ScenarioError for another scenario or a directory that is not empty, and WriteError.
+    Raises ScenarioError if the run belongs to another scenario or the directory is not empty, and
+    WriteError.
     """
     require_scenario(scenario, "save", ", directory", "run, ")
     directory = as_path("directory", directory)

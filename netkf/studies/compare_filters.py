@@ -196,7 +196,8 @@ def compare_filters(
     right together with probability ``confidence``. ``runs``, ``seed`` and the other options are
     those of ``netkf.monte_carlo``, for each filter.
 
-    Raises ScenarioError if no filter can run, and for an unknown kind, key or value.
+    Raises ScenarioError if no filter can run, if there is no such kind, or for a table with a wrong
+    key or value.
     """
     require_scenario(scenario, "compare_filters", ", ...")
     confidence = number(above=0.0, below=1.0)("confidence", confidence)

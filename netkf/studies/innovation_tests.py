@@ -178,7 +178,8 @@ class InnovationTests(NotebookTable):
 
 
 def innovations(run: Run | Scenario, confidence: float = 0.99) -> InnovationTests:
-    """Test the innovations of each node of a ``run``, or of a scenario; no true state is needed.
+    """Test the innovations of each node of a ``run``, or of one that is simulated from a scenario.
+    No true state is needed.
 
     The innovations of the filter ``central`` are attributed to the nodes whose sensors gave the
     readings, in their order within an instant. Raises NetkfError without readings or covariances.

@@ -356,7 +356,8 @@ def fit_noise(
     else the size of Q), which for a random walk is its rate, and that of each component of the R of
     each ``[[sensors]]`` entry (or the size of an R that is not diagonal). What is 0 stays 0.
 
-    ``confidence`` is that of each interval. Raises ScenarioError, see ``log_likelihood``.
+    ``confidence`` is that of the interval of each variance. Raises ScenarioError, see
+    ``log_likelihood``.
     """
     require_scenario(scenario, "fit_noise")
     confidence = number(above=0.0, below=1.0)("confidence", confidence)

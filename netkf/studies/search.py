@@ -395,7 +395,8 @@ def size(
 
     ``seed``, ``workers``, ``executor``, ``scheduler`` and ``engine`` are those of
     ``netkf.monte_carlo``; ``progress`` is called with a line of text as simulations go on. Raises
-    ScenarioError for a wrong key, range or target, TheoryError if theory has no answer.
+    ScenarioError for a wrong key, range or target, TheoryError with ``by="theory"`` if theory has
+    no answer.
     """
     require_scenario(scenario, "size", ", ...")
     if by is not None:

@@ -39,7 +39,8 @@ def assert_promises(
 
     Arguments are those of ``netkf.check``. Rows of the verdict that are undecided, or about
     something that theory does not promise, pass. Raises AssertionError with a line for each broken
-    promise, TheoryError if theory promises nothing, and ScenarioError for bad files or arguments.
+    promise, TheoryError if theory promises nothing about the filter, and ScenarioError for a bad
+    file or bad arguments.
     """
     from netkf.checks.check import check
     from netkf.checks.evidence import BROKEN

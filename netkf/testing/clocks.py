@@ -322,7 +322,8 @@ def check_matching(matching: Any, /, topology: Topology | None = None, **setting
     if ``mean`` raises ScenarioError, a frequency that differs as much from those of the other links
     of a cycle, star or complete graph; a correlation of 0.07 of any two links 1, 2 or 3 slots
     apart. A ``mean`` that differs between equivalent links is accepted. Of recorded matchings only
-    the form is checked, and broadcasts draw nothing. A correct class fails once in a million.
+    the form is checked, and broadcasts draw nothing. A correct class fails once in a million
+    checks.
 
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """

@@ -71,7 +71,8 @@ def check_sensor(sensor: Any, /, **settings: Any) -> None:
     Exact checks: shapes; equal streams give equal readings, whichever other sensors are read,
     whether readings are taken one by one, several at once or with some left out, and however the
     steps of increments are cut; another state changes a reading by H times the difference; only the
-    given generators are used; the sensor survives pickle; H is the same unless it is ``varying``.
+    given generators are used; the sensor survives pickle; H is the same in all readings unless the
+    sensor is ``varying``.
 
     Statistical checks find these errors with probability 0.9 each. From 100,000 readings of all
     nodes together (of increments, 10,000 pieces of steps): a bias of 0.03 standard deviations

@@ -48,7 +48,8 @@ ANY = "any filter"
 def assumptions(scenario: Scenario) -> pd.DataFrame:
     """Return a table with a row for each assumption: assumption, source, holds, evidence.
 
-    ``holds`` is None where it is not known; the paper of the filter decides on them.
+    ``holds`` is None where it is not known. The paper of the scenario's filter decides which
+    assumptions there are.
     """
     import pandas as pd
 

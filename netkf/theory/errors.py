@@ -59,7 +59,8 @@ def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> Flo
     block stays below P_i, which this shows without Monte Carlo. Regressors are those of the run;
     delays, losses and filter models that differ from the truth are included; recorded states and
     readings are treated as if they had the law that the scenario gives them. Raises TheoryError for
-    filters that are not affine and for those whose verbs are Python, or a user's.
+    filters that are not affine and for those whose verbs are plain Python, also where a user's
+    subclass overrides one.
     """
     if not stacked:
         return _estimated_blocks(scenario, run, about_mean=True)

@@ -44,7 +44,9 @@ def without_padding(e: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArra
 
 
 def traces(P: FloatArray) -> FloatArray:
-    """Return traces (...) of P (..., n, n) over estimated states, nan where all of P is."""
+    """Return the traces (...) of covariances P (..., n, n) over the states that a node estimates,
+    nan where all of P is.
+    """
     variances = np.diagonal(P, axis1=-2, axis2=-1)
     missing = np.isnan(variances)
     if not missing.any():

@@ -40,7 +40,8 @@ class Run(NotebookTable):
     ``rounding_from`` on. ``status`` is complete, interrupted or diverged. ``sums`` holds the sums
     over all nodes that exchanges should conserve: at the start and at the last sample. Unless
     ``truth_known``, x is nan and tables have no columns of errors. ``stats`` holds the counts that
-    the engine keeps of its own work. ``scenario`` is that which was simulated, or None.
+    the engine keeps of its own work. ``scenario`` is the ``netkf.Scenario`` that was simulated,
+    None if it is unknown.
     """
 
     times: FloatArray
@@ -102,7 +103,9 @@ class Run(NotebookTable):
 
     @cached_property
     def rounding(self) -> FloatArray:
-        """The magnitude (T,) of the rounding error of ``error``, by the numbers computed with."""
+        """The magnitude (T,) of the rounding error of ``error``: that of the numbers that the run
+        computes with.
+        """
         sizes = np.abs(self.error).max(axis=1) if self.exact_errors else np.abs(self.x)
         return np.asarray(ROUNDING * sizes.max(axis=1))
 

@@ -166,7 +166,9 @@ def copy_vector(
 def copy_root(
     lanes: Lanes, size: Size, target: FloatArray, k: int, source: FloatArray, m: int, flags: Any
 ) -> None:
-    """Copy the lower triangle of ``source[m]`` (n, n, L) to ``target[k]`` in lanes of ``flags``."""
+    """Copy the lower triangle of ``source[m]`` (n, n, L) to that of ``target[k]`` in the lanes with
+    ``flags`` (True: all).
+    """
     for i in range(len(size)):
         for j in range(i + 1):
             old = load(lanes, target, k, i, j)

@@ -655,7 +655,9 @@ def write_message(record: Any, h: int, m: int, n: int, now: float, q: int) -> No
 
 @kernel
 def absorb(record: Any, h: int, run: Any) -> None:
-    """Replace each sender's evidence by that of its message, unless what is there is newer."""
+    """Replace the evidence of each sender by that of its message, unless the one that node ``h``
+    has was sent later.
+    """
     f, p, n, links = record.work, record.payload, len(run.size), (run.first[h], run.first[h + 1])
     for q in range(len(run.lanes)):
         if not is_told(record, h, run, q):
@@ -698,7 +700,9 @@ def is_told(record: Any, h: int, run: Any, q: int) -> bool:
 
 @kernel
 def shift(record: Any, h: int, run: Any) -> None:
-    """Move the present with the origin; states of the window keep the coordinates of their time."""
+    """Move the present with the origin; states of the window, of which messages are made, keep the
+    coordinates of their time.
+    """
     shift_vector(run, record.xhat, h)
     for q in range(len(run.lanes)):
         first = record.count[h, q] * len(run.size)

@@ -265,7 +265,9 @@ def carry(model: Any, run: Any, x: FloatArray, root: FloatArray, m: int, age: fl
 
 @generic
 def carry_mean(model: Any, run: Any, x: FloatArray, m: int, age: float) -> None:
-    """Predict the mean ``x[m]`` (n, L) of a message ``age`` s old to now; in slots it stays."""
+    """Predict the mean ``x[m]`` of ``x`` (K, n, L), of a message ``age`` seconds old, to now; in
+    slots it stays.
+    """
 
 
 @generic

@@ -59,7 +59,8 @@ def link_rate_for(scenario: Scenario, delta: float) -> LinkRate:
     Paper H Theorem 3 says that there are some: ``max_i |calP_i - S|_F <= delta`` in the steady
     state of H(12), with all rates multiplied by one factor. The distance falls with the rates, in
     the end in proportion to 1/rate; the factor is found to 1e-10. 0 if the nodes have S at any
-    rate. Raises TheoryError without H(12) or S, as with delays, or up to 1e12 times the rates.
+    rate. Raises TheoryError if H(12) or S do not apply, as with delays, or no rate up to 1e12 times
+    the scenario's suffices.
     """
     delta = as_number("delta", delta)
     if not 0.0 < delta < math.inf:

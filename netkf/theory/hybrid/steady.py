@@ -49,7 +49,8 @@ def steady_covariance_bound(scenario: Scenario) -> FloatArray:
     coupled Riccati equations H(12) of the hybrid paper, with a relative residual below 1e-9.
 
     Newton's method from gains that a linear equation has proved stabilising. Raises TheoryError if
-    there is none, with the threshold that link rates would have to reach, or no H(12).
+    there is none, with the threshold that the link rates would have to reach, and if H(12) does not
+    apply.
     """
     P = _steady_state_of(scenario)
     if P is None:

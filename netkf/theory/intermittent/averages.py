@@ -119,7 +119,8 @@ def mean_covariance_bounds(
     from P_0 = ``start`` (n, n) on.
 
     F and Q are (n, n), H (p, n), R (p, p); readings arrive with probability g = ``delivery``. A
-    slot maps P to ``f_0(P) = F P F' + Q``, or to ``f_1(P)``, a step of the Riccati equation.
+    slot maps P to ``f_0(P) = F P F' + Q`` without a reading, and to ``f_1(P)``, the step of the
+    Riccati equation, with one.
 
     The lower bound S counts slots without a reading only, ``S+ = (1 - g) F S F' + Q``; the upper
     one X applies Jensen's inequality to the concave f_1, ``X+ = (1 - g) f_0(X) + g f_1(X)``. The

@@ -89,7 +89,8 @@ def riccati_step(
     """Return ``f_1(P) = F P F' + Q - F P H' (H P H' + R)^-1 H P F'`` (n, n), paper R (17).
 
     A slot with a reading; P, F and Q are (n, n), H (p, n), R (p, p). Computed from square roots by
-    an orthogonal triangularisation, which subtracts nothing. Raises TheoryError.
+    an orthogonal triangularisation, which subtracts nothing. Raises TheoryError if shapes or
+    definiteness are wrong.
     """
     system = check_system(F, Q, H, R)
     start = as_covariance("P", P, len(system.F))
@@ -430,7 +431,8 @@ def couple_from_the_past(
     """Return K exact draws (K, n, n) from the invariant law of a switched Riccati recursion, and
     their last modes (K,) (Propp and Wilson 1996). ``draw(following, T)`` returns T modes before
     ``following`` (K, S), ``propagate(roots, modes)`` applies modes (K, T); ``empty`` (K, 0) fixes K
-    and type. Chains from both ``starts`` (2, n, n) run until they meet, for MAX_PAST slots.
+    and type. Chains from both ``starts`` (2, n, n) run until they meet; TheoryError after MAX_PAST
+    slots.
     """
     out = np.empty((len(empty), *starts.shape[1:]))
     last = np.empty(len(empty), dtype=empty.dtype)

@@ -111,7 +111,8 @@ def riccati_flow(P: ArrayLike, A: ArrayLike, Q: ArrayLike, G: ArrayLike, gap: fl
 
     This is the covariance of a Kalman-Bucy filter, H (4b) of the hybrid paper. All matrices are
     (n, n); ``G = H' R^-1 H``. The relative error is about 1e-15 for any gap. Raises TheoryError for
-    wrong shapes, a P, Q or G that is indefinite, a negative or infinite gap, and overflow.
+    wrong shapes, a P, Q or G that is not positive semidefinite, a negative or infinite gap, and if
+    the solution overflows.
     """
     drift = as_square("A", A)
     n = len(drift)

@@ -20,7 +20,8 @@ def one_bit_update(P: ArrayLike, H: ArrayLike, R: ArrayLike) -> FloatArray:
     once their noises are decorrelated, ``P - (2 / pi) P h' h P / (h P h' + 1)`` for each row h.
 
     P (n, n) is the covariance before them, H is (p, n), R (p, p). A bit is worth 2 / pi of its
-    reading (Ribeiro, Giannakis and Roumeliotis 2006, equation 22). Raises TheoryError.
+    reading (Ribeiro, Giannakis and Roumeliotis 2006, equation 22). Raises TheoryError if shapes or
+    definiteness are wrong.
     """
     # P is checked in the place of Q; F is not used.
     _, result, H_, R_ = check_system(np.eye(len(np.atleast_2d(as_numbers("P", P)))), P, H, R)

@@ -79,7 +79,8 @@ def disconnection_probability(
     The result is a float with ``low``, ``high`` and ``exact``: exact if at most 120,000 partitions
     of open nodes occur (any graph of ten nodes, grids ten wide), else an estimate from ``samples``
     draws (default: 200,000, and fewer in networks of more than 100 nodes, so that it takes
-    seconds). Raises TheoryError for directed graphs, and links without a probability in [0, 1].
+    seconds). Raises TheoryError for directed graphs, and for links without a probability or with
+    one outside [0, 1].
     """
     seed = as_integer("seed", seed, 0, np.inf)
     samples = None if samples is None else as_integer("samples", samples, 1)

@@ -40,7 +40,8 @@ class PushSumLimits(NamedTuple):
 
 def push_sum_limits(scenario: Scenario) -> PushSumLimits:
     """Return the limits, by node, of the push-sum masses and of the gains (n, p) that follow from
-    them: of P Theorem 1 of the push-sum paper, and of its Theorem 2 if links fail.
+    them: of P Theorem 1 of the push-sum paper, and of its Theorem 2 (in probability) for failing
+    links.
 
     Theorem 2 needs links that fail in both directions together. F, Q, H and R are those that the
     filters assume. Raises TheoryError if the graph is not connected or P_inf does not exist, for

@@ -217,7 +217,8 @@ def push_sum_noise(scenario: Scenario, gammas: Sequence[int]) -> FloatArray:
     ``(T' (x) I) E[(M (x) I) cov(h) (M (x) I)'] (T (x) I)``, where (x) is the Kronecker product, M
     (N, N) the random product of gamma averaging steps, h (N n,) the stacked noises of the plant and
     the sensors, and ``T = (v W)`` of paper P (75) with v = (1, .., 1) / sqrt(N) and W any
-    orthonormal complement. Paper P Lemma 4 says its limit. TheoryError as ``large_gamma_limits``.
+    orthonormal complement. Paper P Lemma 4 says what it tends to. Raises TheoryError as
+    ``large_gamma_limits`` does.
     """
     steps = estimation_steps(scenario)
     _require_averaging(scenario, steps)
