@@ -601,8 +601,8 @@ class SourceFile:
     node_ids  the ids of nodes by name, None before a graph is known
     unknown   names in the file that were read before that, with the number -1, -2, ... that stands
               for each until then
-    content   what the file had when the scenario was made, for the copy beside its results; None in
-              a worker
+    content   what the file had when the scenario was made, for the copy beside its results; None
+              before
     """
 
     name: str
@@ -611,10 +611,6 @@ class SourceFile:
     node_ids: Mapping[str, int] | None = dataclasses.field(default=None, compare=False)
     unknown: dict[str, int] = dataclasses.field(default_factory=dict, compare=False)
     content: bytes | None = dataclasses.field(default=None, compare=False)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what a worker needs."""
-        return self.__dict__ | {"content": None}
 
     def __repr__(self) -> str:
         return repr(self.name)
