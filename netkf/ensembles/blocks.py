@@ -19,6 +19,7 @@ from netkf.runs.failures import explain_failure
 from netkf.runs.provenance import versions
 from netkf.scenario.plugins import (
     current_module,
+    edited_module,
     find_unimportable_class,
     unguarded_line,
     user_components,
@@ -112,6 +113,11 @@ def pack_scenario(scenario: Scenario) -> PackedScenario:
     if name is not None:
         message = f"workers cannot import the class {name} of a notebook, a prompt or a function"
         raise EngineError(f"{message}; put it into a module (a .py file), or use workers=1")
+    if (edited := edited_module(scenario)) is not None:
+        message = (
+            f"workers would import {edited.name}, which was edited since the scenario was loaded"
+        )
+        raise EngineError(f"{message}; load the scenario again, or use workers=1")
     line = unguarded_line(scenario)
     if line:
         message = f"each worker would run the script again, because of its class on line {line[0]}"

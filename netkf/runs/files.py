@@ -20,7 +20,7 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError, WriteError
 from netkf.core.fields import SourceFile, as_path
-from netkf.scenario.plugins import find_module_files, find_unimportable_class
+from netkf.scenario.plugins import find_module_files, find_unimportable_class, imported_source
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import source_files
 from netkf.scenario.writing import as_table, resolve_defaults, to_toml
@@ -255,7 +255,7 @@ def write_scenario(
         copy_file(source, directory / source.name)
     for module in find_module_files(scenario).values():
         if module is not None:
-            copy_file(module, directory / module.name)
+            write_bytes(directory / module.name, imported_source(module))
     table = resolve_defaults(scenario) if resolve else as_table(scenario)
     table["seed"] = scenario.seed if seed is None else seed
     write_text(directory / "scenario.toml", to_toml(table))
@@ -263,7 +263,11 @@ def write_scenario(
 
 def copy_file(source: Path | SourceFile, target: Path) -> None:
     """Copy the file ``source`` to ``target`` atomically, one of a scenario as it was read."""
-    content = source.read_bytes()
+    write_bytes(target, source.read_bytes())
+
+
+def write_bytes(target: Path, content: bytes) -> None:
+    """Write a file atomically, unless it has this ``content``; raises WriteError."""
     if target.is_file() and target.read_bytes() == content:
         return
     with writing_file(target):
@@ -275,10 +279,12 @@ def copy_file(source: Path | SourceFile, target: Path) -> None:
 def scenario_digest(scenario: Scenario, **changed: Any) -> str:
     """Return the SHA-256 of a scenario with all defaults, or ``changed`` keys, and its files."""
     digest = hashlib.sha256(to_toml(resolve_defaults(scenario) | changed).encode())
-    files: dict[str, Path | SourceFile] = {one.name: one for one in source_files(scenario)}
-    files |= {f"{name}.py": file for name, file in find_module_files(scenario).items() if file}
-    for name, file in sorted(files.items()):
-        digest.update(name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())
+    contents = {source.name: source.read_bytes() for source in source_files(scenario)}
+    for name, file in find_module_files(scenario).items():
+        if file is not None:
+            contents[f"{name}.py"] = imported_source(file)
+    for name, content in sorted(contents.items()):
+        digest.update(name.encode() + b"\0" + hashlib.sha256(content).digest())
     return digest.hexdigest()
 
 

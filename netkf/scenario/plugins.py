@@ -390,6 +390,17 @@ def current_module(module_name: str, folder: Path) -> Iterator[None]:
     _sources.update(_loaded_sources(names, folder))
 
 
+def imported_source(file: Path) -> bytes:
+    """Return what was in the ``file`` of a module beside a scenario when it was imported."""
+    return _sources.get(file.resolve()) or file.read_bytes()
+
+
+def edited_module(scenario: Component) -> Path | None:
+    """Return the file of a module of a user's class that was edited since it was imported."""
+    files = (file for file in find_module_files(scenario).values() if file is not None)
+    return next((f for f in files if not f.is_file() or f.read_bytes() != imported_source(f)), None)
+
+
 def _loaded_sources(names: Iterable[str], folder: Path) -> dict[Path, bytes]:
     """Return what is in the files in ``folder`` of those modules that are loaded."""
     files = [getattr(sys.modules.get(name), "__file__", None) for name in names]

@@ -12,6 +12,7 @@ import pytest
 
 import netkf
 from netkf.cli.main import main
+from netkf.ensembles.blocks import pack_scenario
 from netkf.runs.files import scenario_digest
 from netkf.scenario import plugins
 from netkf.scenario.plugins import find_module_files
@@ -411,7 +412,8 @@ def test_what_a_class_imports_from_its_folder_comes_along(folder, tmp_path):
         (place / "lowest.py").write_text(f"EPSILON = {epsilon}\n")
         for name in ("json", "netkf", "numpy"):  # are loaded already, from elsewhere
             (place / f"{name}.py").write_text("raise RuntimeError\n")
-        first = netkf.load(scenario(place))
+        first_file = scenario(place)
+        first = netkf.load(first_file)
         assert first.filter.algorithm.own == epsilon
         assert set(find_module_files(first)) == {"evil", "midway", "lowest"}
     short = first.replace({"horizon": 1.0})
@@ -419,7 +421,13 @@ def test_what_a_class_imports_from_its_folder_comes_along(folder, tmp_path):
     assert {"evil.py", "midway.py", "lowest.py"} <= {file.name for file in out.iterdir()}
     digest = scenario_digest(first)
     (tmp_path / "other" / "lowest.py").write_text("EPSILON = 0.3\n")
-    assert scenario_digest(first) != digest
+    # What a scenario was loaded with is its own; workers would import the new one.
+    assert scenario_digest(first) == digest
+    again = netkf.save(netkf.simulate(short), short, tmp_path / "again")
+    assert (again / "lowest.py").read_text() == "EPSILON = 0.2\n"
+    with pytest.raises(netkf.EngineError, match=r"lowest.py, which was edited since the scenario"):
+        pack_scenario(first)
+    assert scenario_digest(netkf.load(first_file)) != digest
 
 
 @pytest.mark.parametrize("edited", ["evil", "lowest"])
