@@ -24,11 +24,10 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.core.errors import ScenarioError, suggest_nearest
-from netkf.core.fields import MAX_MAGNITUDE, SourceFile
+from netkf.core.fields import MAX_BYTES, MAX_MAGNITUDE, SourceFile
 from netkf.core.printable import MAX_NAME, NamedNode
 from netkf.linalg.arrays import FloatArray
 
-MAX_BYTES = 256 << 20  # of a table, unpacked; it limits the memory that reading takes
 MAX_ID = 2**53  # larger integers are not exact as floating-point numbers
 STAMPS = ("t", "from", "until")
 """The columns that hold times, in every table."""
@@ -363,7 +362,8 @@ def _unpacked(source: SourceFile, what: str, if_too_large: str) -> Iterator[_Bou
     """
     start = b""
     try:
-        with source.full.open("rb") as packed:
+        kept = None if source.content is None else io.BytesIO(source.content)
+        with source.full.open("rb") if kept is None else io.BufferedReader(kept) as packed:
             start = packed.peek(2)[:2]  # pipes cannot go back
             yield _Bounded(gzip.GzipFile(fileobj=packed) if start == b"\x1f\x8b" else packed)
     except _TooLargeError:

@@ -593,6 +593,9 @@ def node_id(low: int | None = None, high: int | None = None) -> Rule:
     return Rule(ids.requirement, convert, ids.remedy, schema, of_nodes=True)
 
 
+MAX_BYTES = 256 << 20  # of a table, unpacked; it limits the memory that reading takes
+
+
 @dataclass(frozen=True, repr=False)
 class SourceFile:
     """A file that a scenario refers to: its path ``name`` as written, relative to ``folder``, and
@@ -601,8 +604,8 @@ class SourceFile:
     node_ids  the ids of nodes by name, None before a graph is known
     unknown   names in the file that were read before that, with the number -1, -2, ... that stands
               for each until then
-    content   what the file had when the scenario was made, for the copy beside its results; None
-              before
+    content   what the file had when the scenario was made, which others that are made of that, and
+              the copy beside the results, have too; None before
     """
 
     name: str
@@ -645,9 +648,13 @@ def _convert_source_file(value: Any) -> SourceFile:
         # A symbolic link inside the folder may lead out of it.
         if not source.full.resolve().is_relative_to(folder):
             raise _SpecificError("must stay inside the folder of the scenario file")
-        if not source.full.is_file():
-            raise _SpecificError(f"no such file in {source.folder}")
-        content = source.full.read_bytes()
+        content = source.content
+        if content is None:
+            if not source.full.is_file():
+                raise _SpecificError(f"no such file in {source.folder}")
+            # What is larger is refused by those who read it.
+            if source.full.stat().st_size <= MAX_BYTES:
+                content = source.full.read_bytes()
     except (OSError, RuntimeError) as error:  # a loop of links, a name that is too long
         raise _SpecificError("must be the path of a file that can be read") from error
     return dataclasses.replace(source, name=name, content=content)

@@ -218,7 +218,9 @@ def _build_object(
             values[name] = SourceFile(value, origin.folder, origin.stamps)
         elif isinstance(value, SourceFile):
             # It may have been read with names of nodes of another graph.
-            values[name] = SourceFile(value.name, value.folder, origin.stamps)
+            values[name] = SourceFile(
+                value.name, value.folder, origin.stamps, content=value.content
+            )
     if any(map(_has_missing_class, values.values())):
         # No object can be made yet, but mistakes in other fields are found before any import.
         for name, value in values.items():

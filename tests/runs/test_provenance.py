@@ -42,6 +42,9 @@ def test_a_table_that_was_edited_meanwhile_is_kept_as_it_was_read(ring, tmp_path
     save(run, scenario, tmp_path / "out")
     again = netkf.simulate(netkf.load(tmp_path / "out" / "scenario.toml"))
     np.testing.assert_array_equal(again.xhat, run.xhat)
+    # Another one that is made of it, as points of a sweep are.
+    other = netkf.simulate(scenario.replace({"filter.epsilon": 0.1}))
+    np.testing.assert_array_equal(other.x, run.x)
 
 
 def test_what_the_engine_counted_is_kept(ring, tmp_path):
