@@ -157,7 +157,7 @@ def ensemble_of(scenario: Scenario, statistics: RunStatistics, seed: int, engine
     totals = (statistics.messages.mean[0] * statistics.messages.size).tolist()
     counts = dict(zip(MESSAGES, totals, strict=True))
     return Ensemble(
-        times=scenario.times,
+        times=scenario.times.copy(),
         nodes=scenario.nodes,
         runs=samples.size.astype(np.int64),
         mean_P=mean_P,

@@ -134,7 +134,7 @@ def _read_samples(path: Path, scenario: Scenario) -> dict[str, Any]:
     # The upper triangles of four matrices, then mean and standard error of NEES.
     matrices = [from_upper(upper, n) for upper in np.split(values[:, :, :-2], 4, axis=2)]
     return {
-        "times": scenario.times,
+        "times": scenario.times.copy(),
         "runs": runs.to_numpy(dtype=np.int64)[::N],
         **dict(zip(("mean_P", "se_P", "mean_error", "se_error"), matrices, strict=True)),
         "mean_nees": values[:, :, -2],

@@ -40,7 +40,7 @@ def load(
     path = as_path("path", path, "load takes the path of a scenario file")
     changes = require_changes(changes)
     try:
-        return from_table(change_table(_parse_file(path), changes), path.parent, trust)
+        return from_table(change_table(_parse_file(path), changes), path.absolute().parent, trust)
     except ScenarioError as error:
         raise explain_left_over(error, changes).in_file(str(path)) from None
 

@@ -44,6 +44,14 @@ def assert_same_bits(one, other):
     assert (one.messages, one.fingerprint) == (other.messages, other.fingerprint)
 
 
+def test_times_of_an_ensemble_are_its_own(short, tmp_path):
+    ensemble = netkf.monte_carlo(short, 2)
+    runs_to_directory(short, 2, tmp_path / "out", EnsembleOptions())
+    for found in (ensemble, netkf.open(tmp_path / "out")):
+        found.times[:] /= 60.0
+        assert found.scenario.times[-1] == 1.0
+
+
 class Backwards(Executor):
     """Does what it got last first, and does not tell its number of workers."""
 

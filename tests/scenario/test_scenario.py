@@ -85,6 +85,14 @@ def test_replace_takes_paths_as_in_a_file(ring):
     )
 
 
+def test_a_scenario_knows_its_folder_in_any_current_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(SCENARIOS)
+    scenario = netkf.load("intel_lab.toml", {"horizon": 1.0})
+    monkeypatch.chdir(tmp_path)
+    again = scenario.replace({"seed": 5})
+    assert netkf.save(netkf.simulate(again), again, "run").is_dir()
+
+
 def test_a_class_of_the_user_needs_no_registration(tmp_path, monkeypatch, ring):
     (tmp_path / "fusion.py").write_text(
         textwrap.dedent(

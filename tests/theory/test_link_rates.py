@@ -146,6 +146,21 @@ def test_constant_gains_against_a_plain_integration(ring):
     assert np.abs(slope(0.0, steady.reshape(-1))).max() < 1e-10
 
 
+def test_the_same_bits_whatever_the_generator_of_numpy_is_at(ring, monkeypatch):
+    from netkf.checks import hybrid
+    from netkf.theory.hybrid import constant_gains
+    from netkf.theory.hybrid.coupled import coupling
+
+    for module in (constant_gains, hybrid):
+        monkeypatch.setattr(module, "MAX_DENSE", 0)  # the way for large networks
+    before, found = np.random.get_state(), []  # noqa: NPY002
+    for _ in range(5):
+        bound = theory.constant_gain_bound(ring, [50.0])
+        found.append((bound.tobytes(), hybrid._slowest_mixing(coupling(ring))))
+    assert len(set(found)) == 1
+    assert str(np.random.get_state()) == str(before)  # noqa: NPY002
+
+
 def test_time_varying_gains_are_better(ring, monkeypatch):
     """H Remark 1: the bound stays below that with any constant gains."""
     from netkf.theory.hybrid import constant_gains

@@ -24,6 +24,7 @@ from netkf.theory.hybrid.steady import steady_covariance_bound
 from netkf.theory.numerics.matrices import as_list, as_numbers, as_times
 
 MAX_DENSE = 500  # unknowns up to which the exponential of the whole map is computed
+MAX_STEP = 30.0  # norm of the map over a step beyond that
 
 
 def constant_gain_bound(
@@ -50,13 +51,17 @@ def constant_gain_bound(
     above = scipy.sparse.hstack([linear.matrix(), column])
     below = scipy.sparse.csr_array((1, constant.size + 1))
     all_times = scipy.sparse.csc_array(scipy.sparse.vstack([above, below]))
+    size = float(scipy.sparse.linalg.norm(all_times, 1))
     y, bounds = np.append(packed.start.reshape(-1), 1.0), []
     for gap in np.diff(moments, prepend=0.0):
         if all_times.shape[0] <= MAX_DENSE:
             with np.errstate(over="ignore", invalid="ignore"):
                 y = scipy.linalg.expm(all_times.toarray() * gap) @ y
         elif gap > 0.0:
-            y = scipy.sparse.linalg.expm_multiply(all_times * gap, y)
+            # For longer steps scipy estimates norms with numpy's global generator.
+            steps = int(np.ceil(gap * size / MAX_STEP))
+            for _ in range(steps):
+                y = scipy.sparse.linalg.expm_multiply(all_times * (gap / steps), y)
         if not np.isfinite(y).all():
             raise TheoryError(f"the bound overflows within {gap:g} s: give earlier times")
         bounds.append(packed.unpack(y[:-1].reshape(constant.shape)))
