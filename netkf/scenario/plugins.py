@@ -378,14 +378,14 @@ def current_module(module_name: str, folder: Path) -> Iterator[None]:
     those that it imports: others of their names are removed, and all if one was edited.
     """
     names = module_name, *imports_beside(folder, module_name)
-    for name in names:
-        if _is_namesake(sys.modules.get(name), name, folder):
-            del sys.modules[name]
+    outdated = [name for name in names if _is_namesake(sys.modules.get(name), name, folder)]
     present = _loaded_sources(names, folder)
     if any(_sources.get(file, text) != text for file, text in present.items()):
-        for name in names:
-            sys.modules.pop(name, None)
-    importlib.invalidate_caches()
+        outdated = list(names)
+    for name in outdated:
+        sys.modules.pop(name, None)
+    if outdated:
+        importlib.invalidate_caches()
     yield
     _sources.update(_loaded_sources(names, folder))
 

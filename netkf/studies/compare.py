@@ -207,6 +207,12 @@ def _leaves(value: Any, path: str) -> Iterator[tuple[str, str]]:
         yield from _leaves(entry, f"{path}.{key}" if path else key)
 
 
+def _differing_settings(runs: Sequence[RunDirectory]) -> tuple[ComparedSetting, ...]:
+    keys = dict.fromkeys(key for run in runs for key in run.settings if key not in TITLES)
+    rows = (ComparedSetting(k, tuple(run.settings.get(k, "-") for run in runs)) for k in keys)
+    return tuple(row for row in rows if len(set(row.values)) > 1)
+
+
 @contextmanager
 def damage_named(directory: Path) -> Iterator[None]:
     """Turn a DamagedError into a ScenarioError that names the directory."""
@@ -308,8 +314,6 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
         for q, node in quantities
     ]
     rows += [ComparedRow(q, -1, tuple(Entry(*run.value(q, -1)) for run in runs)) for q in TRACES]
-    keys = dict.fromkeys(key for run in runs for key in run.settings if key not in TITLES)
-    settings = [ComparedSetting(k, tuple(run.settings.get(k, "-") for run in runs)) for k in keys]
     return Comparison(
         directories=tuple(str(run.directory) for run in runs),
         names=tuple(str(run.manifest.get("name", "")) for run in runs),
@@ -317,7 +321,7 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
         confidence=confidence,
         rows=tuple(rows),
         notes=tuple(tuple(run.summary.get("notes", ())) for run in runs),
-        settings=tuple(one for one in settings if len(set(one.values)) > 1),
+        settings=_differing_settings(runs),
         units=tuple(_common_unit(run.settings) for run in runs),
     )
 

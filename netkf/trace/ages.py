@@ -10,6 +10,7 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.small import count_until
 from netkf.linalg.structs import Struct
 from netkf.trace.schema import CODES
 
@@ -248,14 +249,34 @@ def find(table: np.ndarray, values: np.ndarray, value: int) -> int:
     """Return the place of a value in sorted ``values``, by a ``table`` of places unless empty."""
     if len(table) > 0:
         return int(table[value])
-    low, high = 0, len(values)
-    while low < high:
-        middle = (low + high) // 2
-        if values[middle] < value:
-            low = middle + 1
-        else:
-            high = middle
-    return low
+    return count_until(values, value) - 1
+
+
+@kernel
+def follow_message(s: AgeState, row: Any, i: int, t: float, tells_all: np.ndarray) -> bool:
+    """Follow what happens at node ``i`` to a message; return False where there is no room for it.
+    ``row`` is an EVENT; the others are as in ``follow``.
+    """
+    kind = row["kind"]
+    j = find(s.place, s.nodes, row["peer"])
+    # What is sent or lost is an event of the sender, what comes one of the receiver.
+    code = i * len(s.nodes) + j if kind in OF_SENDER else j * len(s.nodes) + i
+    link = find(s.link, s.links, code)
+    if ACTIONS[kind] == SEND:
+        if s.free[-1] == 0:
+            return False
+        s.free[-1] -= 1
+        k = s.free[s.free[-1]]
+        s.number[k], s.sender[k] = row["message"], i
+        s.following[k], s.under_way[link] = s.under_way[link], k
+        fill_message(s, i, k, t, tells_all[row["phase"] + 1])
+        return True
+    k = find_message(s, link, row["message"])
+    if k >= 0 and ACTIONS[kind] == DROP:
+        replace_message(s, k)
+    elif k >= 0:
+        s.following[k], s.inbox[i] = s.inbox[i], k
+    return True
 
 
 @kernel
@@ -268,29 +289,13 @@ def follow(
     """
     for e in range(first, len(rows)):
         row, t = rows[e], times[e]
-        kind = row["kind"]
-        action = ACTIONS[kind]
+        action = ACTIONS[row["kind"]]
         if action == NOTHING:
             continue
-        i, k = find(s.place, s.nodes, row["node"]), 0
+        i = find(s.place, s.nodes, row["node"])
         if SEND <= action <= DELIVER:
-            j = find(s.place, s.nodes, row["peer"])
-            # What is sent or lost is an event of the sender, what comes one of the receiver.
-            code = i * len(s.nodes) + j if kind in OF_SENDER else j * len(s.nodes) + i
-            link = find(s.link, s.links, code)
-            if action == SEND and s.free[-1] == 0:
+            if not follow_message(s, row, i, t, tells_all):
                 return e
-            k = find_message(s, link, row["message"]) if action != SEND else 0
-        if action == SEND:
-            s.free[-1] -= 1
-            k = s.free[s.free[-1]]
-            s.number[k], s.sender[k] = row["message"], i
-            s.following[k], s.under_way[link] = s.under_way[link], k
-            fill_message(s, i, k, t, tells_all[row["phase"] + 1])
-        elif action == DROP and k >= 0:
-            replace_message(s, k)
-        elif action == DELIVER and k >= 0:
-            s.following[k], s.inbox[i] = s.inbox[i], k
         elif action == USE:
             use_waiting(s, i, t)
         elif action == SENSE and not math.isnan(t):
