@@ -1,7 +1,8 @@
 """The binary tree over replicas, by which results of many runs are merged.
 
 Node (level, k) holds the replicas from k 2^level to (k + 1) 2^level - 1. Every result is merged
-along this tree: its bits do not depend on sizes of blocks, workers, or the order of ends.
+along this tree, so that its bits do not depend on the size of blocks, on the workers, or on the
+order of completion.
 """
 
 from __future__ import annotations
@@ -20,9 +21,11 @@ class MergeTree:
         self._waiting: dict[tuple[int, int], Any] = {}
 
     def add(self, k: int, value: Any, level: int = 0) -> None:
-        """Add the ``value`` of node (level, k), of the blocks k 2^level to (k + 1) 2^level - 1.
+        """Add the result ``value`` of node (level, k), which covers the blocks k 2^level to (k + 1)
+        2^level - 1.
 
-        Nodes must not overlap; the last may be smaller. Level 0 may be of blocks of any one size.
+        Nodes must not overlap; the last may have fewer replicas. Level 0 may stand for blocks of
+        any one size.
         """
         while (level, k ^ 1) in self._waiting:
             neighbour = self._waiting.pop((level, k ^ 1))

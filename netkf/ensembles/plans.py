@@ -150,7 +150,8 @@ def work_on_plan(
     most, and write their results.
 
     Several workers on one part do its work twice and no harm. Raises InterruptedRunError (a
-    KeyboardInterrupt) with what was finished written, EngineError, and WriteError.
+    KeyboardInterrupt) when interrupted, with what was finished written, EngineError if a plugged-in
+    class fails, and WriteError.
     """
     replicas, identity, scenario = part.of(plan.identity.runs), plan.identity, plan.scenario
     if plan.is_merged or not replicas:

@@ -1,6 +1,7 @@
 """The start of worker processes: early, and without the threads, memory and script of this one.
 
-The module does not import numpy: a command can start the server of workers before that.
+The module does not import numpy, so that a command can start the server of workers before it loads
+numerical libraries itself.
 """
 
 from __future__ import annotations
@@ -80,7 +81,8 @@ def block_signals() -> Iterator[None]:
 @contextmanager
 def limit_blas_threads() -> Iterator[None]:
     """Limit the numerical libraries of processes that are started within the ``with`` block to one
-    thread each, by environment variables read at loading: there is one worker for each core.
+    thread each, by environment variables that they read when they are loaded: there is one worker
+    process for each core.
     """
     old_values = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))

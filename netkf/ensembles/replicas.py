@@ -61,7 +61,9 @@ class Form(NamedTuple):
 
 def form_of(kind: Any) -> Form:
     """Return the form of results that are named tuples of arrays of this ``kind``."""
-    return Form(lambda v: v._asdict(), lambda arrays: kind(*(arrays[k] for k in kind._fields)))
+    return Form(
+        lambda value: value._asdict(), lambda arrays: kind(*(arrays[k] for k in kind._fields))
+    )
 
 
 class Gap(NamedTuple):
@@ -126,10 +128,12 @@ def replicate_blocks(
     form: Form | None = None,
 ) -> Any:
     """Return ``task(scenario, seed, replicas)`` for blocks of the replicas ``first`` .. ``first +
-    runs - 1``, merged by ``merge(a, b)``, which joins neighbours, a before b, into one.
+    runs - 1``, merged by ``merge(a, b)``, which joins the results of neighbours (a before b) into
+    one of the same kind.
 
     Results are merged in the binary tree over replicas, inside blocks by the task itself. ``task``
-    and ``merge`` are functions of a module, or partials, to import and pickle.
+    and ``merge`` are functions of a module, or partials of such, that workers can import; their
+    results must pickle.
 
     seed     : defaults to the scenario's
     pool     : a pool of make_pool, or options for one that is closed at the end
@@ -188,6 +192,7 @@ def _as_list(task: Task, scenario: Scenario, seed: int, replica: int) -> list[An
 
 
 def _make_blocks(pool: Pool, job: Job, together: int | None, store: BlockStore) -> Iterator[Job]:
+    """Yield the blocks of replicas of ``job`` that are to be simulated, in order, each as a Job."""
     # Runs in slots are simulated in SIMD lanes: fewer runs than lanes take as long.
     slotted = isinstance(job.scenario, Scenario) and job.scenario.slotted
     min_size = together or (LANES if slotted else 1)

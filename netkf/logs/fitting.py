@@ -105,6 +105,7 @@ class LogFit(NotebookTable):
         return self.laws
 
     def __repr__(self) -> str:
+        """Return one line: the log, its links, and the laws that are not rejected."""
         kept = ", ".join(self.laws["law"][self.laws["rejected_by"] == ""]) or "none"
         return (
             f"<netkf fit of {self.scenario.name!r}: {len(self.links)} links, not rejected: {kept}>"
@@ -395,7 +396,11 @@ def _distances(scenario: Scenario, outcomes: LogOutcomes, table: pd.DataFrame) -
 
 
 def _link_table(
-    outcomes: LogOutcomes, table: pd.DataFrame, level: float, shrink: float, apart: Distances | None
+    outcomes: LogOutcomes,
+    table: pd.DataFrame,
+    level: float,
+    shrink: float,
+    distance: Distances | None,
 ) -> pd.DataFrame:
     """Return a row for each link; intervals hold together with probability 1 - ``level``."""
     count, heard = outcomes.counts.T.astype(float)
@@ -419,13 +424,17 @@ def _link_table(
         rows[f"{name}_low"], rows[f"{name}_high"] = stats.binomial_interval(turns, tries, each / 2)
     with np.errstate(divide="ignore"):
         rows["mean_burst"] = 1.0 / rows["to_good"]
-    if apart is not None:
-        rows["distance"] = apart.mean_by_link(apart.value)
+    if distance is not None:
+        rows["distance"] = distance.mean_by_link(distance.value)
     return rows
 
 
 def _fit_laws(
-    outcomes: LogOutcomes, links: pd.DataFrame, apart: Distances | None, shrink: float, bursty: bool
+    outcomes: LogOutcomes,
+    links: pd.DataFrame,
+    distance: Distances | None,
+    shrink: float,
+    bursty: bool,
 ) -> list[FittedLaw]:
     count, heard = outcomes.counts.T.astype(float)
     total = np.array([count.sum(), heard.sum()])
@@ -452,11 +461,11 @@ def _fit_laws(
         n, k = count - tries - losses, heard - (tries - lost + found)
         fit += float(np.sum(xlogy(k, good / (bad + good)) + xlogy(n - k, bad / (bad + good))))
         laws.append(FittedLaw("per-link-bursts", values, fit, turns))
-    if apart is not None and len(count) > 2:
+    if distance is not None and len(count) > 2:
         # What follows from places that change is no correlation in time.
-        moves = len(apart.value) > len(count)
-        values, cov = stats.fit_distance(*apart[:3], 1.0 if moves else shrink)
-        p, count, heard = expit((values[0] - apart.value) / values[1]), *apart[1:3]
+        moves = len(distance.value) > len(count)
+        values, cov = stats.fit_distance(*distance[:3], 1.0 if moves else shrink)
+        p, count, heard = expit((values[0] - distance.value) / values[1]), *distance[1:3]
         fit = float((xlogy(heard, p) + xlog1py(count - heard, -p)).sum())
         if values[1] > 0.0 and values[0] >= 0.0:
             laws.append(FittedLaw("distance", values, fit, cov=cov))
@@ -464,11 +473,13 @@ def _fit_laws(
     return [law._replace(links=pairs) for law in laws]
 
 
-def _shared_law(outcomes: LogOutcomes, p: float, share: stats.Share, shrink: float) -> FittedLaw:
+def _shared_law(
+    outcomes: LogOutcomes, delivery: float, share: stats.Share, shrink: float
+) -> FittedLaw:
     part = min(share.value, 1.0)
-    likelihood, variance = stats.shared_law(outcomes, p, part)
+    likelihood, variance = stats.shared_law(outcomes, delivery, part)
     cov = np.diag([variance * shrink, share.error**2])
-    return FittedLaw("shared", np.array([p, part]), likelihood, cov=cov)
+    return FittedLaw("shared", np.array([delivery, part]), likelihood, cov=cov)
 
 
 def _varying_laws(

@@ -1,4 +1,5 @@
-"""Statistics of the outcomes of packets: deliveries, bursts, shared fate, and tests of laws.
+"""Statistics of the outcomes of packets: deliveries, bursts, shared fate, and tests of what laws
+of losses assume.
 
 Senders are taken as independent of each other. What hearers share, and what follows in time, is
 kept in all variances: sums go over transmissions, which are the units.
@@ -197,14 +198,14 @@ def make_outcomes(table: pd.DataFrame) -> LogOutcomes:
     parts = ["sender", *([] if is_broadcast else ["receiver"]), "channel"]
     for (sender, *_, name), rows in table.assign(channel=channel).groupby(parts):
         wide = rows.pivot_table("delivered", "transmission", "receiver", "max", dropna=False)
-        found = rows.drop_duplicates("transmission").set_index("transmission")
-        found = (
-            found.loc[wide.index].assign(at=np.arange(len(wide))).sort_values("t", kind="stable")
+        order = rows.drop_duplicates("transmission").set_index("transmission")
+        order = (
+            order.loc[wide.index].assign(at=np.arange(len(wide))).sort_values("t", kind="stable")
         )
-        wide = wide.iloc[found["at"].to_numpy()]
-        follows = np.concatenate([[False], np.diff(found["message"]) == 1])
+        wide = wide.iloc[order["at"].to_numpy()]
+        follows = np.concatenate([[False], np.diff(order["message"]) == 1])
         ids = np.array([index[str(sender), str(receiver)] for receiver in wide.columns])
-        groups.append(Group(wide.to_numpy(dtype=float), found["t"].to_numpy(), follows, ids))
+        groups.append(Group(wide.to_numpy(dtype=float), order["t"].to_numpy(), follows, ids))
         channels.append(str(name))
     return LogOutcomes(tuple(links), tuple(groups), tuple(channels))
 

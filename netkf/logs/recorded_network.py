@@ -358,11 +358,7 @@ def _recorded_activation(
         return {**table, "at": at}, log.ticks
     sends = _sends_of(log, {str(node) for node in scenario.nodes}, "that the scenario has not")
     if at != "nodes":
-        pairs = pd.DataFrame({"to": log.outcomes["receiver"]})
-        pairs["sender"] = log.sends["sender"].to_numpy()[log.outcomes["send"]]
-        only = pairs.drop_duplicates().set_index("sender")["to"]
-        if only.index.is_unique and sends["sender"].isin(only.index).all():
-            sends["to"] = sends["to"].mask(sends["to"] == "", sends["sender"].map(only))
+        _name_only_receivers(sends, log)
     needed = "nodes" if (sends["to"] == "").any() else "directions" if at == "nodes" else at
     if needed not in (("links",) if pairing else scenario.node_filter.timing.clocks):
         told = "broadcasts" if needed == "nodes" else "messages to one receiver"
@@ -382,6 +378,15 @@ def _recorded_activation(
     rows = _pairs(sends.replace({"sender": ids, "to": ids})).rename(columns={"t": "slot"})
     table |= {} if pairing.phase is None else {"phase": pairing.phase}
     return table, rows.drop_duplicates().to_csv(index=False)
+
+
+def _name_only_receivers(sends: pd.DataFrame, log: PacketLog) -> None:
+    """Name the receiver of broadcasts of senders that have one hearer each, if all have."""
+    pairs = pd.DataFrame({"to": log.outcomes["receiver"]})
+    pairs["sender"] = log.sends["sender"].to_numpy()[log.outcomes["send"]]
+    only = pairs.drop_duplicates().set_index("sender")["to"]
+    if only.index.is_unique and sends["sender"].isin(only.index).all():
+        sends["to"] = sends["to"].mask(sends["to"] == "", sends["sender"].map(only))
 
 
 def _note_pairs(sends: pd.DataFrame, notes: list[str], what: str) -> None:
