@@ -305,7 +305,7 @@ def set_factors(record: Any, m: int, w: int, q: int) -> float:
 
 @kernel
 def set_joint(record: Any, h: int, m: int, q: int, crossed: bool) -> None:
-    """Write what node ``h`` and the sender of payload ``m`` told; X (n, n') if ``crossed``."""
+    """Write what node ``h`` and payload ``m`` tell, with the cross-covariance X if ``crossed``."""
     f, n, v, p = record.fusion, len(record.A), len(record.A_j), record.payload
     for i in range(n):
         f.x[i] = record.told[h, i, q]
@@ -388,7 +388,7 @@ def use_pairs(record: Any, h: int, run: Any, k: int, mine: bool, q: int) -> bool
 
 @kernel
 def hear(record: Any, h: int, run: Any, k: int, q: int) -> None:
-    """Use what the sender of message ``k`` has read, and the pair, since others were heard."""
+    """Use at node ``h`` the readings that message ``k`` tells, the sender's own and of the pair."""
     f, n, v = record.fusion, len(run.size), len(record.A_j)
     set_own(record, h, n, q)
     for j in range(v):

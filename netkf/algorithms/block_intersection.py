@@ -242,7 +242,7 @@ def predict_sent_blocks(record: Any, h: int, run: Any, k: int) -> None:
 
 @kernel
 def use_common(record: Any, link: int) -> int:
-    """Make the sender's estimate of common states the first rows; return how many they are."""
+    """Make the sender's estimate of common states the first observed rows; return their number."""
     f, entry, row = record.fusion, record.tables.entry, 0
     for i in range(entry.shape[1]):
         if entry[link, i] >= 0:

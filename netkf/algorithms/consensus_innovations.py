@@ -49,7 +49,8 @@ CONVERGED = 1e-14
 
 
 class ConsensusGains(NamedTuple):
-    """The gains of one node in one slot; or of N nodes in K slots, with W directions in order.
+    """The gains of one node in one slot; or of N nodes in K slots, with W directions by receiver
+    and sender.
 
     B : (d, n, n) for the d nodes that it hears, in the order of their indices; or (K, W, n, n)
     M, K : (n, n), of the pseudo-observation in yhat, and of the pseudo-state in xhat; or
@@ -80,7 +81,8 @@ class GainSequence:
 
     The errors ``x - xhat_i`` of all N nodes, then ``y - yhat_i``, are linear in independent inputs
     of variance 1 (x(0), plant noise, sensor noise): ``_errors`` (2 N n, inputs) holds the
-    coefficients: covariances are products of its rows, and differences lose no digits.
+    coefficients, so that covariances are products of its rows, and differences of nearly equal
+    estimates lose no digits.
     """
 
     def __init__(
@@ -208,7 +210,7 @@ class GainSequence:
 
 
 def variances(errors: FloatArray) -> FloatArray:
-    """Return the variances (k,) of ``errors`` (k, inputs), of independent unit inputs."""
+    """Return the variances (k,) of ``errors`` (k, inputs), linear in independent unit inputs."""
     return np.asarray(np.square(errors).sum(axis=1))
 
 

@@ -95,7 +95,7 @@ def use_sample(record: Any, h: int, run: Any) -> None:
 
 @kernel
 def predict_closed_loop(record: Any, h: int, run: Any) -> None:
-    """Predict node ``h``: the estimate open loop, P by ``A - L H``, which counts that noise."""
+    """Predict node ``h``: the estimate by A, P by ``A - L H``, which counts noise of increments."""
     tables = record.loops.tables
     if tables.models[h] < 0:
         predict_estimate(run.model, run, record.xhat, record.root, h, h)
@@ -124,14 +124,14 @@ def use_sample_or_increments(record: Any, h: int, run: Any) -> None:
 
 @kernel
 def closed_loop_interval(record: Any, h: int, _run: Any) -> float:
-    """Return the seconds of increments for one update: 1 / |L H|, as fast as the gain acts."""
+    """Return the seconds of increments for one update: 1 / |L H|, the time scale of the gain."""
     return usable(record.loops.rate[h])
 
 
 def constant_gain_record(
     filtering: ConstantGain, infos: Sequence[NodeInfo], models: Sequence[Any]
 ) -> Record:
-    """Return the matrices of all nodes: for readings, and closed loops under clocks."""
+    """Return the gain matrices of all nodes for readings, and their closed loops under clocks."""
     N, n = len(infos), len(models[0].information)
     gains = [filtering.gain_of(info.place) for info in infos]
     settings: dict[str, Any] = {

@@ -51,7 +51,7 @@ def absorb(record: Any, h: int, run: Any) -> None:
 
 
 def diffusion_message_size(n: int, rows: int, phase: int) -> int:
-    """Return the numbers in a message: y, H, R of ``rows`` rows, or psi with n states."""
+    """Return how many numbers a message has: y, H and R of ``rows`` rows, or psi of n states."""
     return n if phase == ESTIMATES else rows * (1 + n) + rows * (rows + 1) // 2
 
 

@@ -140,7 +140,7 @@ def information_consensus_record(
 
 @dataclass(frozen=True, eq=False)
 class InformationConsensus(Filter):
-    """Consensus on information pairs, ``steps`` times a slot, by ``recipe`` of derived classes.
+    """Consensus on information pairs, ``steps`` times a slot; ``recipe`` says which pairs.
 
     The weights are Metropolis', ``1 / (1 + max degree)`` for each link; the weight of a message
     that does not come stays with the node itself, so that weights always sum to one.
@@ -163,7 +163,7 @@ class InformationConsensus(Filter):
 
     @abstractmethod
     def recipe(self, nodes: int) -> Recipe:
-        """Return the recipe for N ``nodes``: where pairs begin, and how often each counts."""
+        """Return for N ``nodes`` which pairs a slot begins with, and how often each counts."""
 
     @property
     def analysis(self) -> Analysis:

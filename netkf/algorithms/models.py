@@ -467,7 +467,7 @@ def as_floats(values: Any) -> FloatArray:
 
 
 def first_root(cov: FloatArray) -> FloatArray:
-    """Return lower triangular S (n, n), ``S S' = cov``, of ``cov`` (n, n), maybe singular."""
+    """Return lower triangular S (n, n) with ``S S' = cov`` (n, n), which may be singular."""
     return lower_root(square_root(cov))
 
 

@@ -44,7 +44,7 @@ class ModeSplit(NamedTuple):
 
 
 def slot_rates(F: FloatArray) -> FloatArray:
-    """Return the growth log |lambda| per slot (n,) of F's modes, finite also of a singular F."""
+    """Return the growth log |lambda| per slot (n,) of F's modes, also finite if F is singular."""
     tiny = np.finfo(float).tiny
     return np.asarray(np.log(np.maximum(np.abs(np.linalg.eigvals(F)), tiny)))
 

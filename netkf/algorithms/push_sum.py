@@ -1,4 +1,5 @@
-"""The push-sum filter: distributed Kalman filtering on links that fail, paper P Fig. 1.
+"""The push-sum filter: distributed Kalman filtering on links that fail, paper P Fig. 1 (Battilotti,
+Cacace and d'Angelo 2023).
 
 In slots node i does the steps of P Fig. 1:
 
@@ -282,7 +283,8 @@ def has_converged(
     tolerance: float,
 ) -> bool:
     """Return True if N^(i), from ``former_number`` to ``number``, and G^(i), from ``former[h]``
-    (n, n, L) to ``information`` (n, n, L), but for ``tolerance`` (relative) in lane ``q``.
+    (n, n, L) to ``information`` (n, n, L), changed by at most ``tolerance`` (relative; Frobenius
+    norm) in lane ``q``.
     """
     # ``not <`` rejects nan.
     if not abs(number - former_number) < tolerance * number:

@@ -96,7 +96,7 @@ def _is_shape(shape: Any) -> bool:
 
 
 def triangle_numbers(n: int, *count: int) -> IntArray:
-    """Return numbers of a lower triangle (n, n), or ``count`` roots (n, n + 1) of information."""
+    """Number the entries of a triangle (n, n), or ``count`` roots (n, n + 1); others are -1."""
     sent = np.ones((*count, n, n + len(count)), dtype=bool)
     sent[..., :n] = np.tri(n, dtype=bool)
     return np.where(sent, np.cumsum(sent).reshape(sent.shape) - 1, -1)

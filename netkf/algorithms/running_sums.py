@@ -10,7 +10,8 @@ node predicts its own estimate and covariance.
 A round offers each of the d nodes that can hear the share 1 / (d + 1) of all mass. What travels
 is not the share but the total ``sent`` of all shares so far; a receiver gains the difference to
 the last total that it ``heard``. So a lost message only delays mass, and the weight in nodes and
-under way stays N (running-sum push-sum). In the limit of fast rounds nodes are central.
+under way stays N (running-sum push-sum; P has no such form). In the limit of fast rounds every node
+is the central filter.
 
 Totals refer to an instant: as time passes they are predicted with the plant, without its noise, for
 which ``U -> Phi^-T U Phi^-1`` and ``u -> Phi^-T u`` with Phi = e^{A gap} would be right. All totals

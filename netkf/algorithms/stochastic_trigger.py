@@ -95,7 +95,7 @@ def predict_prior(record: Any, h: int, run: Any) -> None:
 
 @kernel
 def emit_reading(record: Any, h: int, m: int, run: Any) -> None:
-    """Send the reading with probability 1 - exp(-z' Y z / 2), and the rows of later silence."""
+    """Send the reading with probability 1 - exp(-z' Y z / 2), and the rows for later silence."""
     lanes, rows, matrix = run.lanes, run.rows[run.reading], run.first_H + run.matrix[run.reading]
     for k in range(rows):
         for i in range(len(run.size)):
@@ -232,7 +232,7 @@ F = TypeVar("F", bound=type[Filter])
 
 
 def forwarding(cls: F) -> F:
-    """Let a filter say of itself, but for what ``cls`` defines, what ``wrapped`` says."""
+    """Give a class the public attributes of its ``wrapped`` filter that it does not define."""
     for name in vars(Filter).keys() - vars(cls).keys():
         if not name.startswith("_"):
             setattr(cls, name, _forwarded(name, vars(Filter)[name]))
@@ -396,7 +396,7 @@ class TriggeredMessages(Filter):
         return None if inner is None else with_trigger(inner)
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> WrappedState:
-        """Return the wrapped filter's state from ``mean`` (n,) and ``cov`` (n, n), undecided."""
+        """Return the wrapped filter's state from ``mean`` (n,), ``cov`` (n, n), and no decision."""
         return WrappedState(self.inner.init(model, mean, cov, node))
 
     def predict(self, state: WrappedState, gap: float) -> WrappedState:

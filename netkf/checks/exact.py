@@ -342,7 +342,7 @@ def _compare_pooled(joint: FloatArray, level: float) -> Interval:
 
 @error_test
 def check_bias(samples: RunSamples, level: float) -> Finding:
-    """Test that errors have no constant bias, by least squares from ``runs.bias`` (R, n, n + 1)."""
+    """Test for a constant bias of errors, by generalised least squares from ``runs.bias``."""
     # Only these runs have exact covariances.
     max_runs = max_replayed(samples.scenario)
     bias, Sigma = samples.runs.bias[:max_runs], samples.runs.Sigma[:max_runs]

@@ -111,7 +111,7 @@ def pool(
 
 def compare_laws(pairs: Sequence[Pair], level: float, start: float = 0.0) -> Finding:
     """Test that samples of each pair have one law within LAW_TOLERANCE: Kolmogorov-Smirnov by
-    diagonal entry. Roundings of ``start``, the largest trace at 0, remain in P.
+    diagonal entry; ``early`` before a limit is reached. P keeps roundings of ``start``, its trace.
     """
     single_level, early = level / sum(pair.first.shape[-1] for pair in pairs), False
     intervals = []

@@ -55,7 +55,7 @@ def law_distance(
 
 
 def law_excess(first: FloatArray, second: FloatArray, level: float) -> Interval:
-    """Return an interval for the largest ``P(second > x) - P(first > x)`` of (S,) and (S',)."""
+    """Return an interval for the largest ``P(second > x) - P(first > x)`` of two samples."""
     gaps = _ecdf_gaps(first, second, rounding=0.0)
     return _band_interval(gaps, len(first), len(second), level, grow=True)
 

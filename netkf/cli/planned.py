@@ -1,6 +1,6 @@
 """``netkf plan``, ``work`` and ``merge``, and ``--plan`` of the commands of studies.
 
-Of a study all of them run it, on a pool of files: see ``ensembles.planned_study``.
+All of them run a study itself, on a pool whose results are files: ``ensembles.planned_study``.
 """
 
 from __future__ import annotations

@@ -67,7 +67,7 @@ def is_netkf_class(cls: type) -> bool:
 
 
 def source_line(code: CodeType, line: int | None = None) -> str:
-    """Return "file, line n" of ``code``, or of a ``line`` in it, relative if it is below here."""
+    """Return "file, line n" of ``code``, or of ``line`` in it; relative paths below this folder."""
     return file_line(code.co_filename, code.co_firstlineno if line is None else line)
 
 
@@ -133,7 +133,7 @@ def _describe_compilation(error: Any) -> str:
 
 
 def kernel_problem(value: Any, names: Sequence[str]) -> str:
-    """Return what is wrong with a ``value`` as a kernel of these ``names``, "" if nothing is."""
+    """Return why ``value`` is no kernel with arguments of these ``names``, "" if it is one."""
     if not (isinstance(value, Kernel) or (is_plain() and callable(value))):
         return f"must be a kernel (netkf.kernels.kernel), not {quote(value)}"
     loops = inspect.unwrap(getattr(value, "loops", value))

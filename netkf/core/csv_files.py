@@ -387,7 +387,7 @@ def read_content(source: SourceFile) -> bytes:
 
 @contextmanager
 def open_table(source: SourceFile) -> Iterator[_Sheet]:
-    """Yield the header and the rows of an open table, as texts; raises ScenarioError."""
+    """Yield the header and the rows, as texts, of an open table; ScenarioError if it is none."""
     remedy = "split readings among several [[sensors]] entries, or write fewer digits"
     with _unpacked(source, " as a UTF-8 table", remedy) as unpacked:
         buffered = io.BufferedReader(unpacked, 1 << 16)

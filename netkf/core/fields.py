@@ -1,7 +1,8 @@
 """Dataclass fields that validate their values, and the base class of scenario components.
 
 ``field(rule)`` declares a field; the rule converts the value that a file or a script gives and
-describes a wrong one in one line. Files and Python meet the same rules, by construction.
+describes a wrong one in one line. Files and Python meet the same rules because both go through
+``Component.__post_init__``.
 """
 
 from __future__ import annotations

@@ -28,7 +28,8 @@ class Rank(IntEnum):
 
     The origin of coordinates moves first. Nodes go down and up. Sensors read, and nodes use all
     samples of the instant. Then clocks tick, and senders take a snapshot of their state; then
-    delayed messages arrive; then every node with messages absorbs all of them. Probes are last.
+    delayed messages arrive; then every node with messages absorbs all of them at once. Probes see
+    the result.
     """
 
     REBASE = 0

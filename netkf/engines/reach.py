@@ -58,7 +58,7 @@ class Reach:
         return is_up
 
     def look_at_all(self, slot: int | None, now: float) -> None:
-        """Record all links that have changed since then; ``slot``: now, None under clocks."""
+        """Record all links that changed since the last look, in ``slot``, None under clocks."""
         self.slot = slot
         if self._radius is not None:
             for link in self._links:

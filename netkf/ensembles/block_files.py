@@ -110,7 +110,7 @@ class BlockFiles(ABC):
 
     @abstractmethod
     def require_fit(self, arrays: Any, stored: dict[str, Any]) -> int:
-        """Return the runs of a block's arrays; raises DamagedError if ``stored`` misfits."""
+        """Return the number of runs of ``arrays``; raises DamagedError if ``stored`` misfits."""
 
     def find(
         self, identity: RunIdentity, any_installation: bool = False, within: range | None = None
@@ -321,7 +321,7 @@ def digest_of(file: BinaryIO, length: int) -> bytes:
 
 @contextlib.contextmanager
 def open_block(file: Path, verified: bool = True) -> Iterator[Any]:
-    """Yield a block's arrays by name, its digest checked but if ``verified``; DamagedError."""
+    """Yield a block's arrays by name; DamagedError if the digest, unless ``verified``, is wrong."""
     try:
         if not verified:
             verify(file)

@@ -223,7 +223,7 @@ class PoolOptions:
     executor  : an executor of concurrent.futures, or a pool that is used as it is
     scheduler : address of a Dask scheduler
 
-    By default runs are simulated in this process, and on one per core once that saves time.
+    By default runs are simulated in this process, and on a process per core once that saves time.
     """
 
     workers: int | None = None

@@ -128,7 +128,8 @@ class FigureSet:
 
 def plot_to_files(result: Any, names: tuple[str, ...], out: Path, file_format: str) -> list[Path]:
     """Write the figures of these names (default: all but slow ones) as ``out`` if that is a picture
-    file, else ``out``/NAME.``file_format``; return the paths. ScenarioError, WriteError.
+    file, else ``out``/NAME.``file_format``; return their paths. Raises ScenarioError and
+    WriteError.
     """
     figure_set = FigureSet(result)
     omit_slow = not names

@@ -148,7 +148,7 @@ def _split_word(line: str, width: float, size: float, weight: str) -> list[str]:
 
 
 def label_text(text: object, most: int = 24) -> str:
-    """Return a name as one line of up to ``most`` characters, its dollar signs no formulas."""
+    """Return a name as one line of up to ``most`` characters; its dollar signs begin no formula."""
     return shorten(text, most).replace("$", r"\$")
 
 

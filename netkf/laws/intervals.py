@@ -205,21 +205,21 @@ def with_drawn(interval: Interval, sample_factor: Callable[[float], float]) -> I
     return interval._replace(again=limits)
 
 
-def deviation_interval(expected: float, one: Interval) -> Interval:
-    """Return the interval of |quantity - expected| from the ``one`` of the quantity."""
-    covers = one.low <= expected <= one.high
-    ends = abs(one.low - expected), abs(one.high - expected)
+def deviation_interval(expected: float, seen: Interval) -> Interval:
+    """Return the interval of |quantity - expected| from the one ``seen`` of the quantity."""
+    covers = seen.low <= expected <= seen.high
+    ends = abs(seen.low - expected), abs(seen.high - expected)
     low = 0.0 if covers else min(ends)
-    distance = abs(one.value - expected)
+    distance = abs(seen.value - expected)
     # A forecast keeps the estimate on the same side of the expected value, only nearer to it.
-    side = math.copysign(1.0, one.value - expected)
+    side = math.copysign(1.0, seen.value - expected)
 
     def limits(value: float, factor: float) -> tuple[float, float]:
-        ends = one.limits(expected + side * value, factor)
+        ends = seen.limits(expected + side * value, factor)
         return 0.0, max(abs(end - expected) for end in ends)
 
     return Interval(
-        distance, low, max(ends), one.detectable, seen=one.value, expected=expected, again=limits
+        distance, low, max(ends), seen.detectable, seen=seen.value, expected=expected, again=limits
     )
 
 

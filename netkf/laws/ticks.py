@@ -381,7 +381,7 @@ def count_interval(
 
 
 def compare_gaps(counts: TickCounts, level: float) -> tuple[LawComparison, LawComparison]:
-    """Compare gaps of R runs with their law, and neighbours', at half of ``level`` each."""
+    """Compare gaps of R runs with their law, and correlations with 0, each at half of ``level``."""
     shares = compare_shares(counts.cells.sum(axis=0), level / 2.0, "gaps")
     correlation = neighbour_correlation(counts.products, level / 2.0)
     if correlation is None:

@@ -57,7 +57,7 @@ class Generic:
 
 
 def generic(function: Callable[..., Any]) -> Generic:
-    """Make a function of kernels registered by class; its own body is not used."""
+    """Make a function whose kernels are registered by class; its own body is not used."""
     return Generic(function)
 
 

@@ -14,7 +14,7 @@ ROUNDING = 2.0**-54  # relative size of an entry that is too small to change the
 @kernel
 def diagonalise(a: FloatArray, vectors: FloatArray) -> None:
     """Leave the eigenvalues of a symmetric ``a`` (n, n) on its diagonal, zeros elsewhere, and write
-    its eigenvectors into the columns of ``vectors`` (n, n). Cyclic (Golub and Van Loan, 8.5).
+    its eigenvectors into the columns of ``vectors`` (n, n). Cyclic sweeps (Golub, Van Loan, 8.5).
     """
     n = len(a)
     for i in range(n):

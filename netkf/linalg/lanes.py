@@ -121,7 +121,7 @@ def gather(
     ``array[places[q]]`` into lane q of the L rows of ``out`` from ``first`` on.
 
     ``array`` (K, W), with K places, and ``out`` (W, L) are taken as matrices, whatever their axes,
-    and have memory behind them (``with_spare``). Where a place (L,) is negative, any row comes.
+    and have memory behind them (``with_spare``). If a place (L,) is negative, lane q gets any row.
     """
     taken = array.reshape(len(array), -1)[np.maximum(places, 0), first : first + len(lanes)]
     out.reshape(-1, len(lanes))[first : first + taken.shape[1]] = taken.T

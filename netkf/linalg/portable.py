@@ -75,7 +75,7 @@ def norm(x: FloatArray) -> FloatArray:
 
 
 def cholesky(matrix: FloatArray) -> FloatArray:
-    """Return lower triangular ``L`` (n, n), ``L L' = matrix``, of a positive definite one."""
+    """Return lower triangular ``L`` (n, n) with ``L L' = matrix``, which is positive definite."""
     L = np.array(matrix, dtype=np.float64)
     for k in range(len(L)):
         # One outer product a step: every entry is reduced in the order of k, whatever the CPU.

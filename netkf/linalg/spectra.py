@@ -88,7 +88,8 @@ def contracts(radius: float) -> bool:
 
 def hidden_mode(A: FloatArray, C: FloatArray, border: Border | None = None) -> complex | None:
     """Return an eigenvalue of ``A`` (n, n) whose mode the outputs ``C x``, C (p, n), do not show,
-    or None (Popov, Belevitch, Hautus). With a ``border``, RATE or FACTOR, not of decaying modes.
+    or None (test of Popov, Belevitch and Hautus). With a ``border``, RATE or FACTOR, modes that
+    decay are skipped.
 
     Neither units of states that A couples nor those of all outputs together matter.
     """

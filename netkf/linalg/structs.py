@@ -88,7 +88,7 @@ class Struct(metaclass=StructClass):
 
     @classmethod
     def of_size(cls, n: int) -> Any:
-        """Return the structs' class for length n of ``size``: its own up to MAX_UNROLLED."""
+        """Return the class of structs with n numbers in ``size``: its own up to MAX_UNROLLED."""
         # Larger states share one compiled kernel, whatever their n.
         if n > MAX_UNROLLED:
             return cls

@@ -40,7 +40,8 @@ def carried_network(run: Run) -> networkx.Graph[Any]:
     Nodes have ``sensors`` (their number) and, if they stay, ``x`` and ``y``; links numbers of
     messages ``sent``, ``delivered``, ``lost`` and ``late``, their ``mean_age`` (s), and maybe
     ``delivery_probability``. Undirected ones have those of the other direction as ``sent_back`` and
-    so on, unless a table tells directions apart. Links that follow positions: those that carried.
+    so on, unless a table tells directions apart. Links that follow positions are there if they
+    carried.
     """
     import networkx
 

@@ -148,7 +148,7 @@ class Layout:
         return self._by_key.get((name, node), self._by_key.get((name, None)))
 
     def require(self, name: object, node: int, whose: str = "") -> Place:
-        """Return block ``name`` of ``node``, called ``whose``; raises ScenarioError without one."""
+        """Return block ``name`` of ``node``, ``whose`` in messages; ScenarioError without one."""
         if name not in self.names:
             listed = ", ".join(f'"{one}"' for one in self.names)
             remedy = f"{suggest_nearest(name, self.names)}names are {listed}"

@@ -95,7 +95,7 @@ def write_report(
 
 
 def _require_page(path: Path) -> None:
-    """Raise ScenarioError if ``path`` may be a file that is no page; WriteError if no file."""
+    """Raise ScenarioError if ``path`` is or would be a file but no page; WriteError if no file."""
     require_own(path)
     if MimeTypes().guess_type(path.name)[0] not in (None, "text/html"):
         rule = "is no name of a page, which is HTML"

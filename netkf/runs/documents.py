@@ -123,7 +123,8 @@ TEXTS = "a list of texts"
 
 def require_form(value: Any, form: Any, key_path: str = "") -> None:
     """Raise DamagedError at ``key_path`` unless a JSON value has a ``form``: NUMBER, COUNT, TEXT,
-    TEXTS, a list [form of items], or {key: form of value}; keys with ``?`` are optional.
+    TEXTS, a list [form of items], or {key: form of value}; keys with ``?`` are optional, others
+    allowed.
     """
     named = "a table" if isinstance(form, dict) else "a list" if isinstance(form, list) else form
     if not (_FORMS[form](value) if named is form else isinstance(value, type(form))):

@@ -303,7 +303,8 @@ def lock_directory(
     directory: Path | None, must_be_empty: bool = False, option: str = "--out"
 ) -> Iterator[None]:
     """Create a directory, which an ``option`` names, and hold its lock, which dies with the
-    process, during the body; nothing for None. Notes missing locks; removes an empty directory.
+    process, during the body; nothing for None. Notes where locks are not supported; removes a new
+    directory that stays empty.
 
     Raises ScenarioError if another command holds the lock, if it cannot be created, or if it
     ``must_be_empty`` and is not.

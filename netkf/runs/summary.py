@@ -107,7 +107,8 @@ class SampleIndices(NamedTuple):
 def select_averaged_samples(
     times: FloatArray, rounding_from: float, diverged: bool
 ) -> SampleIndices:
-    """Return the samples of averages over time: after 0 (or all), not the last of ``diverged``.
+    """Return the samples of averages over time: those after time 0 (or all), without the last one
+    of a run that ``diverged``.
 
     Errors from ``rounding_from`` on are left out because rounding dominates them, and covariances
     at the same times if the run diverged, because they grow without bound.

@@ -52,7 +52,8 @@ class Missing(NamedTuple):
 
 @dataclass(frozen=True)
 class InformationSource:
-    """What of ``node``, the source, had reached the node asked about. Times in seconds, or nan.
+    """The information of one ``node``, the source, that had reached the node asked about. Times are
+    in seconds, nan if unknown.
 
     sensor          the source has a sensor
     neighbour       the source can send to the node asked about directly

@@ -217,7 +217,7 @@ class BackwardSearch:
         return path
 
     def needed(self, messages: IntArray) -> IntArray:
-        """Return how many unused ones each of ``messages`` (K,) needs, or NEVER."""
+        """Return how many unused messages each of ``messages`` (K,) needs, itself one, or NEVER."""
         # ``deadline`` is the row before which information has to be in a segment to reach the node.
         flow = self.flow
         used, cost = flow.messages.used_row[messages], flow.cost[messages]

@@ -100,7 +100,8 @@ def filter_rows(
 
 
 class CentralModel:
-    """A scenario's central Kalman filter over a ``replica``'s readings, by variances of noises.
+    """The central Kalman filter of a scenario over the readings of a ``replica``, as a function of
+    the variances of its noises.
 
     times, nodes, components : (M,) seconds and ids of scalar readings, and which values of all that
                                the node reads they are

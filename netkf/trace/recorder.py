@@ -2,7 +2,8 @@
 
 Engines append events to a list as tuples, which is passed on in blocks, or hand over blocks of
 events; samples arrive one or several at a time. Both go to sinks, which keep them in memory or
-write them to files. From the first long block on, a thread calls the sinks, in order.
+write them to files. From the first long block on, a thread calls the sinks, in order, while the
+engine continues.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ def fill_legendre_integrals(
 ) -> None:
     """Write ``int_0^g e^{sign M u} P_j(1 - 2 u / g) du`` (n, n) over a ``gap`` g in seconds for the
     Legendre polynomials P_0 (into ``J_1``) and P_1 (into ``second``), with M (n, n). ``sign`` is 1
-    or, to go back in time, -1. ``work`` (4, n, n) is scratch and has e^{sign M g} first.
+    or, to go back in time, -1. ``work`` (4, n, n) is scratch; ``work[0]`` ends as e^{sign M g}.
     """
     n, norm, J_2 = len(M), 0.0, work[3]
     for i in range(n):

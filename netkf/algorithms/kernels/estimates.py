@@ -34,7 +34,8 @@ def update_by_row(
     """Update estimate ``k`` with one whitened row ``y = h x + v``, v of variance 1, in the lanes
     whose flag in ``arrived`` is set (True: all): ``x += P h' (h P h' + 1)^-1 (y - h x)``.
 
-    ``place`` = (r, m, i): the row is ``y[r, i]`` (L,), h = ``H[m, i]`` (n, L); two ``scratch``.
+    ``place`` = (r, m, i): the row is ``y[r, i]`` (L,) with h = ``H[m, i]`` (n, L); ``scratch`` are
+    two arrays (n, L).
     """
     r, m, i = place
     row = local_lanes_vector(size, lanes, scratch[0])

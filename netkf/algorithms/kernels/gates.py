@@ -81,7 +81,7 @@ def gate_tables(
 
 
 def own_sizes(infos: Sequence[Any], n: int, pooled: bool) -> IntArray:
-    """Return how many states each node has of its own blocks: n without any, or ``pooled``."""
+    """Return how many of n states each node owns: all without blocks, or of a ``pooled`` filter."""
     return np.array([n if pooled else info.own_states(n) for info in infos], dtype=np.int64)
 
 

@@ -46,7 +46,8 @@ def add_reading_pair(
     run: Any, total: FloatArray, share: float, r: int, centre: FloatArray, h: int, work: FloatArray
 ) -> None:
     """Add ``share`` times the information pair ``(H' H, H' y)`` of the whitened reading number
-    ``r`` to the root ``total`` (n, n + 1, L), relative to ``centre[h]``, with ``work``.
+    ``r`` to the root ``total`` (n, n + 1, L), relative to ``centre[h]`` (n, L); ``work``
+    (n, n + 1, L) is scratch.
     """
     lanes, n, factor = run.lanes, len(total), share**0.5
     first, matrix = run.first_y + r, run.first_H + run.matrix[r]

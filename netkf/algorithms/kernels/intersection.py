@@ -132,7 +132,7 @@ def finish_lanes(
     ``centre[h]`` (n, L): Z^-1 into ``root[h]`` (n, n, L) and ``centre + Z^-1 z`` into ``xhat[h]``
     (n, L), which may be the centre itself.
 
-    Lanes with the flag ``unchanged`` (L,) stay; ``whitened`` (n, n + 1, L) is scratch.
+    ``unchanged`` lanes (L,) keep their estimate; ``whitened`` (n, n + 1, L) is scratch.
     """
     # S = Z^-1: the total is lower triangular, so P = Z^-1 Z^-T has the lower root Z^-1.
     n = len(size)

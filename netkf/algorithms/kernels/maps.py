@@ -127,7 +127,7 @@ def move_estimate(
     slot: int,
     scratch: tuple[FloatArray, FloatArray],
 ) -> None:
-    """Predict estimate ``k`` from number ``slot`` to the next; two ``scratch`` (n, n, L)."""
+    """Predict estimate ``k`` from ``slot`` to the next; ``scratch`` are two arrays (n, n, L)."""
     slot, root_Q = min(slot, len(model.u) - 1), model.roots[count_until(model.changes, slot)]
     if model.distance > 0.0:
         for q in range(model.active):

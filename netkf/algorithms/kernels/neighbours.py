@@ -57,7 +57,7 @@ def combine_convex(record: Any, h: int, run: Any) -> None:
 
 @kernel
 def use_readings_heard(record: Any, h: int, run: Any) -> None:
-    """Update node ``h`` with its messages' readings in turn, for independent noise at once."""
+    """Update node ``h`` by the readings heard in turn, which is one update of independent noise."""
     for k in range(run.count):
         if run.heard[k] >= 0:
             arrived = load_flags(run.lanes, run.arrived, k)

@@ -74,7 +74,7 @@ class NonlinearRows(Struct):
 
 
 def linear_rows(filters: int, p: int, entries: np.ndarray) -> NonlinearRows:
-    """Return linear rows of H = ``filters`` filters; of each, or all, ``entries`` (H or 1, n)."""
+    """Return linear rows of H = ``filters`` filters of states ``entries`` (H, n), or all (1, n)."""
     shape, n = (filters, p), entries.shape[1]
     integers = ("kind", "dimensions", "relative", "length")
     scratch: dict[str, tuple[int, ...]] = {

@@ -71,7 +71,8 @@ def common_basis(
 def regular_diagonal(root: FloatArray, i: int) -> float:
     """Return entry ``i`` of the diagonal of a lower triangular ``root`` (n, n), in size at least
     SINGULAR (2^-25) times the length of its row: what is smaller is rounding, and two such roots
-    would be thin in directions that rounding tells apart. P gets no smaller.
+    would be thin in directions that rounding tells apart, and their fusion overconfident. P gets
+    no smaller.
     """
     # As in ``intersection.invert_lanes``, the floor grows with the whole root.
     square = TINY
@@ -135,7 +136,8 @@ def slope(w: float, W: FloatArray, b: FloatArray, inverse: bool, trace: bool) ->
     of its determinant unless ``trace``.
 
     ``W`` (n, n) and ``b`` (n,) are those of ``common_basis``: both covariances are diagonal in the
-    basis W, with variances 1 (weight w) and b (weight 1 - w), by ``inverse`` or not.
+    basis W, with variances 1 (weight w) and b (weight 1 - w). ``inverse`` chooses the fusion, see
+    ``fused_variance``.
     """
     total = 0.0
     for k in range(len(b)):
@@ -232,7 +234,8 @@ def fuse_pair(
 @kernel(inlined=True)
 def other_gain(p: float, w: float, b: float, inverse: bool) -> float:
     """Return the gain (0 to 1) of the other estimate in a direction in which the variances are 1
-    (own, weight ``w``), ``b`` (other) and ``p`` (fused), see ``fused_variance``.
+    (own, weight ``w``), ``b`` (other, weight 1 - w) and ``p`` (fused); ``inverse`` as in
+    ``fused_variance``.
     """
     # p times the information that the other one adds to 1/p: (1 - w) / b, or, of inverse
     # intersection, 1/b less its share (1 - w) of the common part 1/m, m = w + (1 - w) b.

@@ -164,7 +164,7 @@ def write_present(record: Any, h: int, n: int, q: int) -> None:
 
 @kernel
 def leave_out_oldest(f: PathScratch, n: int, count: int) -> None:
-    """Write the root ``S`` without the ``n`` oldest states, ``count`` ones, into ``square``."""
+    """Write the root ``S`` without its ``n`` oldest of ``n + count`` states into ``square``."""
     for i in range(count):
         for j in range(n + count):
             f.square[i, j] = f.S[0, n + i, j, 0] if j <= n + i else 0.0
@@ -194,7 +194,7 @@ def eliminate(E: FloatArray, count: int, rows: int, columns: int) -> int:
 
 @kernel
 def mark(record: Any, h: int, n: int, links: tuple[int, int], now: float, q: int) -> None:
-    """Make the present an instant of the window of node ``h``, without the oldest of a full one."""
+    """Add the present to the window of node ``h``; a full window loses its oldest instant."""
     K = record.count[h, q]
     if K > 0 and record.times[h, K - 1, q] == now:
         return
@@ -249,7 +249,7 @@ def forget_oldest(record: Any, h: int, n: int, links: tuple[int, int], q: int) -
 
 @kernel
 def load_evidence(record: Any, w: int, out: FloatArray, q: int) -> int:
-    """Write the evidence of link ``w`` into ``out``, its values last; return how many readings."""
+    """Write the evidence of link ``w`` into ``out``, values last; return the number of readings."""
     last = len(record.work.former) - 1
     for r in range(record.rows[w, q]):
         for j in range(record.evidence.shape[1]):

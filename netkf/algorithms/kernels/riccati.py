@@ -115,7 +115,7 @@ def flow_covariance(A: FloatArray, Q: FloatArray, G: FloatArray, gap: float) -> 
 
 
 def move_covariances(flow: RiccatiFlow, P: FloatArray) -> FloatArray:
-    """Return covariances (..., n, n) after the gap of a ``flow``, from ``P`` before it."""
+    """Return the covariances (..., n, n) at the end of the gap of a ``flow`` that begins at P."""
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(flow.parts):
             # P (I + G P)^-1 = (I + P G)^-1 P

@@ -121,7 +121,7 @@ class FlowScratch(Struct):
 
 
 def flow_scratch(table: FlowTable, unrolled: bool = False) -> FlowScratch:
-    """Return scratch for all models of a table; ``unrolled``: of types that know a small n."""
+    """Return scratch for all models of a table; ``unrolled``: its types know n if it is small."""
     n, q = table.levels.shape[-1], table.whitened_H.shape[1]
     cls = FlowScratch.of_size(n) if unrolled else FlowScratch
     # ``values`` also takes the n n entries of a level, which are fewer.
@@ -245,7 +245,7 @@ def later_cells(
 
 def pack_series(parts: FloatArray, observed: bool) -> FloatArray:
     """Return the series (C, terms, width) of a FlowTable for C cells from those of exp(A g), F,
-    Q_g and G_g in ``parts`` (4, C, terms, n, n): a row for each term; F, G_g if ``observed``.
+    Q_g and G_g in ``parts`` (4, C, terms, n, n), a row for each term; F and G_g if ``observed``.
     """
     E, F, Q_g, G = parts
     rows, columns = np.tril_indices(E.shape[2])
@@ -420,7 +420,7 @@ def double_levels(
 
 
 def upper_root(rows: FloatArray) -> FloatArray:
-    """Return upper triangular U (n, n), ``U' U = rows' rows``, of ``rows`` (k, n), extended."""
+    """Return upper triangular U (n, n) with ``U' U = rows' rows`` (k, n), in extended precision."""
     n = rows.shape[1]
     work = np.concatenate([rows, np.zeros((n, n))]).astype(WIDE)
     for i in range(n):
@@ -443,7 +443,7 @@ def upper_root(rows: FloatArray) -> FloatArray:
 
 
 def cholesky_root(Q: FloatArray) -> FloatArray:
-    """Return the lower triangular root of Q (n, n) in its precision; rounding counts as 0."""
+    """Return the lower triangular root of Q (n, n), as precise; pivots like rounding count as 0."""
     n = len(Q)
     L = np.zeros_like(Q)
     for j in range(n):
@@ -690,9 +690,9 @@ def propagate_mean(
 
 
 @kernel(inlined=True, fused=True)
-def condition_root(lanes: Lanes, size: Size, S: FloatArray, w: FloatArray, V: FloatArray) -> None:
+def condition_root(lanes: Lanes, size: Size, S: FloatArray, row: FloatArray, V: FloatArray) -> None:
     """Replace S (n, n, L), a lower triangular root of P in each of L lanes, by one of
-    ``P (I + G P)^-1``: the update with the information G of the readings of a gap. ``w``
+    ``P (I + G P)^-1``: the update with the information G of the readings of a gap. ``row``
     (>= width, L) holds the triangle of G by rows behind Q_g, exp(A g), F; V (n, n, L) is scratch.
     """
     n = len(size)
@@ -704,7 +704,7 @@ def condition_root(lanes: Lanes, size: Size, S: FloatArray, w: FloatArray, V: Fl
             for r in range(j, n):
                 # G is symmetric and packed: (i, r) and (r, i) are one entry.
                 g = i * (i + 1) // 2 + r if r <= i else r * (r + 1) // 2 + i
-                total += load(lanes, w, begin + g) * load(lanes, S, r, j)
+                total += load(lanes, row, begin + g) * load(lanes, S, r, j)
             store(lanes, V, i, j, total)
         for i in range(j + 1):
             total = spread(lanes, 1.0 if i == j else 0.0)
@@ -800,7 +800,7 @@ def predict_root_lanes(
     triangular, is overwritten; ``W`` (n, n, L) is scratch.
     """
     n = len(size)
-    # wide = F S; S is lower triangular, so the sum begins at r = j.
+    # W = F S; S is lower triangular, so the sum begins at r = j.
     for i in range(n):
         for j in range(n):
             total = spread(lanes, 0.0)

@@ -196,7 +196,7 @@ def scratch_of(n: int, L: int) -> dict[str, FloatArray]:
 
 
 def size_of(n: int, unrolled: bool) -> Size:
-    """Return the ``size`` of a run: of types that know n, if it is small and ``unrolled``."""
+    """Return the ``size`` of a run, whose type knows a small n if loops are to be ``unrolled``."""
     # Loops over one state need no unrolling.
     return sized(n) if unrolled and n > 1 else np.zeros(n)
 
@@ -277,7 +277,7 @@ def update_estimate(model: Any, run: Any, x: FloatArray, root: FloatArray, k: in
 
 @generic
 def transition(model: Any, run: Any, x: FloatArray, k: int, out: FloatArray) -> None:
-    """Write the derivative (n, n, L) of estimate ``k`` ``run.gap`` seconds later into ``out``."""
+    """Write the derivative (n, n, L) of the prediction of ``k`` over ``run.gap`` s into ``out``."""
 
 
 @transition.register(SlotModelArrays)

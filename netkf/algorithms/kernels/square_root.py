@@ -21,12 +21,12 @@ TINY = 1e-300  # below any squared length of a row that counts, yet above underf
 
 
 def lower_triangular(array: FloatArray) -> FloatArray:
-    """Return lower triangular L (..., r, r), ``L L' = array array'``, of (..., r, c >= r)."""
+    """Return lower triangular L (..., r, r), ``L L' = array array'``, of matrices (r, c >= r)."""
     return np.asarray(np.swapaxes(np.linalg.qr(np.swapaxes(array, -1, -2), mode="r"), -1, -2))
 
 
 def lower_root(root: FloatArray) -> FloatArray:
-    """Return lower triangular S (n, n) >= 0 on its diagonal, ``S S' = root root'``, of (n, c)."""
+    """Return lower triangular S (n, n), diagonal >= 0, with ``S S' = root root'`` of (n, c)."""
     n, columns = root.shape
     # QR of the transpose needs at least as many columns as rows.
     wide = np.concatenate([root, np.zeros((n, max(n - columns, 0)))], axis=1)
@@ -39,7 +39,7 @@ def lower_root(root: FloatArray) -> FloatArray:
 def reflect(work: FloatArray, i: int, c: int, rows: int, columns: int) -> None:
     """Apply, from the right and in place, the Householder reflection of the columns ``c`` to
     ``columns`` - 1 of ``work`` (>= rows, >= columns) that zeroes row ``i`` right of column ``c``,
-    to the rows ``i`` to ``rows`` - 1. In row ``i`` entries right of that column mean zero.
+    to the rows ``i`` to ``rows`` - 1. In row ``i`` read the entries right of that column as zeros.
     """
     square = 0.0
     for j in range(c, columns):
@@ -66,11 +66,11 @@ def reflect(work: FloatArray, i: int, c: int, rows: int, columns: int) -> None:
 def reflect_row(
     lanes: Lanes, size: Size, i: int, end: int, W: FloatArray, T: FloatArray, square: Any, on: Any
 ) -> None:
-    """Apply the Householder reflection from the right that zeroes row ``i`` of [wide, T] except its
-    diagonal entry, which becomes nonnegative, to the rows from ``i`` on, in place, in the
-    ``on`` lanes (flags (L,) of runs side by side).
+    """Apply the Householder reflection from the right that zeroes row ``i`` of [W, T] except its
+    diagonal entry, which becomes nonnegative, to the rows from ``i`` on, in place, in the lanes
+    that are ``on`` (flags (L,) of runs side by side).
 
-    wide and T are (n, n, L), T lower triangular. Row ``i`` has the squared length ``square`` (L,);
+    W and T are (n, n, L), T lower triangular. Row ``i`` has the squared length ``square`` (L,);
     in ``W`` its entries are in columns ``i`` to ``end`` - 1, right of its diagonal as they were.
     """
     # With v = row i + signed e_i the reflection is I - v v' / (length head).

@@ -121,7 +121,8 @@ def update_joint(
 @kernel
 def close_row(P: FloatArray, h: FloatArray, closed: FloatArray, k: FloatArray) -> None:
     """Update P (n, n) by one whitened row h (n,), ``P <- (I - k h) P (I - k h)' + k k'`` with the
-    gain ``k = P h' / (h P h' + 1)`` (n,), scratch, and multiply ``closed`` by ``I - k h``.
+    gain ``k = P h' / (h P h' + 1)``, and multiply ``closed`` by ``I - k h`` from the left. ``k``
+    (n,) is scratch.
 
     This is the Joseph form: a rounding error of k changes P in second order only.
     """

@@ -103,8 +103,8 @@ def is_near(
 
 @kernel(inlined=True)
 def is_positive(lanes: Lanes, work: FloatArray) -> Any:
-    """Return flags (L,) of the symmetric matrices ``work`` (n, n, L), given by their lower
-    triangles, positive definite: L D L' elimination, which overwrites them, has positive pivots.
+    """Return which (L,) of the symmetric matrices ``work`` (n, n, L), stored as lower triangles,
+    are positive definite: L D L' elimination, which overwrites them, has positive pivots only.
 
     Axes: L runs side by side.
     """

@@ -1,7 +1,7 @@
 """Batches of runs in continuous time, whose ticks, paths and noise are drawn together.
 
 For a short run the calls of Python that draw and prepare it cost as much as its events. Here they
-are made once for all runs of a batch. Every number is that of a run that is alone.
+are made once for all runs of a batch. Every number is as in a run that is simulated alone.
 """
 
 from __future__ import annotations
@@ -174,7 +174,7 @@ def _batch_arrays(scenario: Scenario, start: Filters, draws: BatchDraws) -> Batc
 
 def drawn_together(scenario: Scenario) -> bool:
     """Return True if runs are drawn together, for filters of one state of a plant that does not
-    change, and nodes that do not move: without samples, or with those of kernels without a grid.
+    change, and nodes that do not move: by increments alone, or by kernels' samples alone.
     """
     if scenario.views is not None or len(scenario.plant.changes) or scenario.links_move:
         return False

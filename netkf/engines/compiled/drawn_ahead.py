@@ -1,4 +1,4 @@
-"""Random numbers of many streams, by their numbers there: drawn when needed, many at a time."""
+"""Random numbers of many streams, by their place in a stream: drawn when needed, many at a time."""
 
 from __future__ import annotations
 

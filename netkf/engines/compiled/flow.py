@@ -324,7 +324,7 @@ class FlowRun:
         self._entries = np.maximum(entries_of(scenario), 0)
 
     def to_the_end(self) -> str:
-        """Simulate and record up to the horizon, or to what is not finite; return the status."""
+        """Simulate up to the horizon, or to an estimate that is not finite; return the status."""
         try:
             # Any value but DONE.
             request = WANT_ROWS

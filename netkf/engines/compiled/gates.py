@@ -15,7 +15,7 @@ from netkf.trace.schema import CLIP, REFUSE, SEND, SENSE
 
 
 def ungated_readings(scenario: Scenario) -> str | None:
-    """Return readings that a gate would look at and kernels do not; None if it need not."""
+    """Return which readings a gate judges that kernels do not; None without any."""
     algorithm, kernels = scenario.node_filter, scenario.node_filter.kernels
     if scenario.filter.gate is None:
         return None

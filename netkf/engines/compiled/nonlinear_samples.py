@@ -66,7 +66,7 @@ class NonlinearTable(Struct):
 
 @kernel
 def linearise_instant(record: Any, h: int, instant: int, table: NonlinearTable) -> None:
-    """Replace nonlinear samples of an ``instant`` by whitened linear ones, for node ``h``."""
+    """Replace nonlinear samples of an ``instant`` by whitened linear ones at ``h``'s estimate."""
     rows, p = table.rows, 0
     for i in range(rows.kind.shape[1]):
         rows.kind[0, i] = LINEAR

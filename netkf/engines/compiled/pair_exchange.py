@@ -106,7 +106,7 @@ def send_both(exchange: PairExchange) -> None:
 
 @kernel
 def receive(exchange: PairExchange, side: int, receivers: IntArray) -> bool:
-    """Let ``side`` (0 or 1) use what the other sent to ``receivers`` (L,) >= 0; False for none."""
+    """Let node ``side`` use what the other sent in lanes with ``receivers`` >= 0; False if none."""
     exchange.message[0], exchange.link[0] = 1 - side, side
     done, rows = 0, exchange.weight_row[side]
     for first in range(len(receivers)):

@@ -1,6 +1,6 @@
 """The one loop of all filters in slots, which calls the verbs of a filter by address.
 
-It simulates S slots of B blocks of L runs in one call, by a :class:`SlotPlan`.
+It simulates S slots of B blocks of L runs in one call, from the draws of a :class:`SlotPlan`.
 """
 
 from __future__ import annotations

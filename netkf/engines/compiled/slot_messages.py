@@ -212,7 +212,7 @@ def draw_link(
     links: SlotChannels, r: int, link: int, fresh: bool, e: int, t: float, up: np.ndarray, q: int
 ) -> None:
     """Draw which messages of one activation of ``link`` arrive in step ``e`` of run ``r``, which
-    begins at ``t`` seconds, into lane ``q`` of ``up`` (W, L). Links that are not ``fresh`` stay.
+    begins at ``t`` seconds, into lane ``q`` of ``up`` (W, L). Others than ``fresh`` ones stay.
     """
     channels, uniform, last = links.channels, links.uniform, -1
     for w in range(link * links.per_link, (link + 1) * links.per_link):

@@ -187,7 +187,7 @@ class SlotSetup:
 
     @cached_property
     def gated_parts(self) -> list[list[tuple[int, int, int]]]:
-        """First row, number of rows and node (id) of each reading of each filter; tables share."""
+        """First row, row count and node (id) of each reading of each filter's table."""
         parts: list[list[tuple[int, int, int]]] = [[] for _ in range(self.estimators)]
         for s in self.assigned:
             p = len(s.R)
@@ -423,7 +423,7 @@ class SlotSetup:
         return self.has_known_probabilities and network.channel.delay.fixed == 0.0 and exchanges
 
     def activity(self, slots: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return (S,) bool for ``slots``: whether events are recorded, nodes act, and exchange."""
+        """Return (S,) bool for ``slots``: if events are recorded, nodes act, and nodes exchange."""
         timing, recorded = self.algorithm.timing, slots < self.last
         # At the horizon filters that predict are only sampled: the prediction is the result.
         acts = recorded | (not timing.predicts)
@@ -464,7 +464,7 @@ class SlotSetup:
         return 8 * floats + messages + len(self.fresh) * asked
 
     def block_slots(self, runs: int, max_events: int) -> int:
-        """Return how many slots of ``runs`` one call simulates, by ``max_events`` (0: no limit)."""
+        """Return how many slots of ``runs`` a call simulates, for ``max_events`` (0: no limit)."""
         slots = BLOCK_BYTES // (blocks_of(runs) * LANES * self.bytes_of_slot())
         if max_events:
             slots = min(slots, max_events // max(1, self.rows_of(1)))

@@ -599,7 +599,7 @@ class SlotTables:
 
     def events(self, sampled: IntArray, stopped: IntArray) -> tuple[np.ndarray, IntArray]:
         """Return the events of the slots just made as EVENT rows (K,), and the number of rows
-        before the samples of slots ``sampled``, (T,). ``stopped`` (N,): the slot that stops a node.
+        before the samples of slots ``sampled``, (T,). ``stopped`` (N,): the slot where nodes stop.
         """
         groups = [*self._starts, *self._rows_of(self._times, self._messages)]
         if self._setup.stages.stopping >= 0:

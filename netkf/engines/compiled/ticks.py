@@ -228,7 +228,7 @@ def end_of_run(t: FloatArray, source: IntArray, begin: int, count: int) -> int:
 def put_in_time_order(
     begin: float, end: float, count: int, buffer: TickBuffer, ordered: TickBuffer, sorting: Sorting
 ) -> None:
-    """Sort the first ``count`` ticks, even over [begin, end) s, into ``ordered``."""
+    """Sort the first ``count`` ticks, evenly spread over [begin, end) s, into ``ordered``."""
     # Ticks are evenly spread, hence about one in each of ``count`` equal bins.
     place, source, scale = sorting.place, sorting.source, count / (end - begin)
     # Counting sort by bin: count, sum up, and place.

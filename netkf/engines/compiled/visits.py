@@ -381,7 +381,7 @@ def prefetch_path_and_noise(state: Simulation, visits: Visits, v: int, place: in
 @kernel
 def process_intervals(state: Simulation, visits: Visits) -> None:
     """Predict all sensing nodes in the queue ``visits.intervals`` up to the times of their visits,
-    using their increments, L at a time in SIMD lanes; empties the queue, in ``state``.
+    using their increments, L at a time in SIMD lanes; empties the queue. Changes ``state``.
     """
     while visits.first_interval < visits.after_intervals:
         # begin_interval() adds the next interval of a node behind the others, so the queue ends

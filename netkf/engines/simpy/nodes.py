@@ -134,7 +134,7 @@ class View:
 
 
 class SeenPart:
-    """Linearises readings of a state of n by a ``function``, for a node of ``entries`` (n',)."""
+    """Linearises readings of n states by ``function`` for a node that estimates ``entries``."""
 
     def __init__(self, function: Any, entries: np.ndarray, n: int) -> None:
         self._function, self._entries, self._n = function, entries, n
@@ -432,7 +432,7 @@ class ClockedNode(Node):
         return mean, cov
 
     def set_up(self, up: bool, time: float) -> None:
-        """Use increments from ``time`` (s) on, or no more; a shared filter, those of nodes up."""
+        """Use increments from ``time`` (s) on, or no more; a shared filter those of nodes up."""
         if self._increments and self.node >= 0:
             self.predict_to(time)
             self.moving_model.set_reading(up)
@@ -470,7 +470,7 @@ class ClockedNode(Node):
 
     def _read(self, end: float, shown: float) -> FloatArray:
         """Return the moments (2 p,) of the increments of all sensors since those before, up to
-        ``end``, when the clock shows ``shown`` (both in s), the readings being the same.
+        ``end``, when the clock shows ``shown`` (both in s), whose pace does not change them.
         """
         truth, start, self._read_to = self._truth, self._read_to, end
         x_moments = truth.moments(start, end)

@@ -90,7 +90,7 @@ class SamplingProcess:
     def run(
         self, timeline: Timeline, truth: Any, receiver: ClockedNode, up: Callable[[int], bool]
     ) -> Process:
-        """Read ``truth`` at the sample times, for ``receiver`` if the node is ``up``."""
+        """Read the ``truth`` at the sample times, for ``receiver`` while the node is ``up``."""
         for k, time in enumerate(self.times.tolist()):
             yield timeline.at(time, Rank.SENSE, self.entity)
             # Relative to the moving origin, like the estimates.

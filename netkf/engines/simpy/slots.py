@@ -1,7 +1,7 @@
 """Scenarios in slots: all nodes follow one schedule of predictions, readings and exchanges.
 
 Each node is a process that follows the schedule of the filter; each node with sensors has another
-process that reads them; and one process, the slot clock, lets nodes, or pairs, transmit.
+process that reads them; one process, the slot clock, lets nodes, or pairs, transmit at once.
 """
 
 from __future__ import annotations

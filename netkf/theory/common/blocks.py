@@ -77,7 +77,8 @@ def scenario_of_all(scenario: Scenario) -> Scenario:
 class SeenErrors(ErrorColumns):
     """The errors of nodes that estimate blocks, from ``whole`` ones of nodes that estimate all. If
     these do not talk, what a node has of blocks that nothing else drives, and from readings of
-    these alone, without others; else they have the own blocks first (``Needs.coupled``).
+    these alone, does not depend on the others; else they have the own blocks first
+    (``Needs.coupled``).
     """
 
     def __init__(self, whole: ErrorColumns, scenario: Scenario) -> None:

@@ -212,7 +212,7 @@ def large_gamma_limits(scenario: Scenario) -> LargeGamma:
 
 
 def push_sum_noise(scenario: Scenario, gammas: Sequence[int]) -> FloatArray:
-    """Return the exact covariance (len(gammas), N n, N n) of the noise of paper P (29).
+    """Return the exact covariance (len(gammas), N n, N n) of the transformed noise of paper P (29).
 
     ``(T' (x) I) E[(M (x) I) cov(h) (M (x) I)'] (T (x) I)``, where (x) is the Kronecker product, M
     (N, N) the random product of gamma averaging steps, h (N n,) the stacked noises of the plant and
