@@ -360,6 +360,7 @@ def usual_runs(scenario: Scenario) -> int:
     return USUAL_RUNS if nodes <= MANY_NODES else max(MIN_RUNS, MANY_ERRORS // nodes)
 
 
+@np.errstate(under="ignore")
 def check(
     scenario: Scenario,
     runs: int | None = None,

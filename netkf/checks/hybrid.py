@@ -40,7 +40,7 @@ from netkf.theory.hybrid.coupled import coupling, reason_without_bound
 from netkf.theory.hybrid.dense import SparseOrFull
 from netkf.theory.hybrid.second_moments import second_moment_rate
 from netkf.theory.hybrid.steady import has_steady_state
-from netkf.theory.numerics.matrices import undetectable_mode
+from netkf.theory.numerics.matrices import arnoldi_start, undetectable_mode
 
 BOUND_TOLERANCE, SLOPE_TOLERANCE = 0.1, 0.3
 """Tolerated relative excess over the bound, and error of the exponent of the distance to S."""
@@ -205,8 +205,7 @@ def _slowest_mixing(mixing: SparseOrFull) -> float:
     if laplacian.shape[0] <= MAX_DENSE:
         return float(np.sort(np.linalg.eigvals(laplacian.toarray()).real)[1])
     largest = float(leaving.max())
-    # Without a start scipy draws one, another in every call.
-    start = np.random.default_rng(0).uniform(-1.0, 1.0, len(leaving))
+    start = arnoldi_start(len(leaving))
     try:  # the eigenvalues closest to a point just below 0, where the matrix is regular
         values = scipy.sparse.linalg.eigs(
             laplacian, k=2, sigma=-1e-6 * largest, v0=start, return_eigenvectors=False, tol=1e-8

@@ -111,6 +111,7 @@ class Ensemble(NotebookTable):
         return pd.DataFrame(ensemble_table(self))
 
 
+@np.errstate(under="ignore")
 def monte_carlo(
     scenario: Scenario,
     runs: int,

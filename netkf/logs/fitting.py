@@ -125,6 +125,7 @@ def read_fit(directory: Path) -> SimpleNamespace:
     return SimpleNamespace(envelope=table)
 
 
+@np.errstate(under="ignore")
 def fit_log(
     directory: str | Path,
     runs: int | None = None,
@@ -204,7 +205,7 @@ def read_outcomes(scenario: Scenario) -> tuple[pd.DataFrame, list[str]]:
     if not isinstance(loss, RecordedLoss):
         rule, remedy = "must be recorded to be fitted", "name a folder that netkf import left"
         raise ScenarioError("network.channel.loss.kind", rule, type(loss).__name__, remedy)
-    table = _read_table(loss.path.full)
+    table = _read_table(loss.path.full, loss.path)
     table["unreported"] = False
     path, last = loss.path.full.with_name(UNKNOWN), table[KEY]
     if path.is_file():
@@ -251,9 +252,11 @@ def _tell_channels(
     return table.drop(columns="channel"), test
 
 
-def _read_table(path: Path) -> pd.DataFrame:
-    """Return a table of messages, one row each; raises ScenarioError, with the line."""
-    table = read_text_rows(path)
+def _read_table(path: Path, source: SourceFile | None = None) -> pd.DataFrame:
+    """Return a table of messages, one row each, of a scenario as the ``source`` was when that was
+    made; raises ScenarioError, with the line.
+    """
+    table = read_text_rows(path, source)
     for name in [*KEY, "t", "transmission", "delivered"]:
         if name in table and name not in KEY[:2]:
             table[name] = parse_numbers(path, table, name)

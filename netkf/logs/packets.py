@@ -72,13 +72,12 @@ class PacketLog:
     ticks: Path | None = None
 
 
-def read_text_rows(path: Path) -> pd.DataFrame:
+def read_text_rows(path: Path, source: SourceFile | None = None) -> pd.DataFrame:
     """Return a table as texts by line number, names in lower case; raises ScenarioError."""
     rows: list[list[str]] = []
     lines: list[int] = []
-    source = SourceFile(path.name, path.parent)
     try:
-        with open_table(source) as sheet:
+        with open_table(source or SourceFile(path.name, path.parent)) as sheet:
             header, separator = [name.lower() for name in sheet.header], sheet.separator
             for line, row in sheet.rows:
                 if len(row) != len(header):

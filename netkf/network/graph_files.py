@@ -119,7 +119,8 @@ class EdgelistGraph(GraphFile):
 
 def _read_links(graph: networkx.Graph[Any], path: str) -> LinkTable:
     ids = assign_ids(graph.nodes)
-    twice = [name for name, count in Counter(map(str, ids)).items() if count > 1]
+    counts = Counter(str(label).strip() for label in ids)
+    twice = [name for name, count in counts.items() if count > 1]
     if twice:
         raise ScenarioError("", "two nodes have one name", twice[0], "rename one of them")
     directed = graph.is_directed()

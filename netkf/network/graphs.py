@@ -468,7 +468,7 @@ class Edges(Graph):
                     rule = f"node ids must be 0 .. {self.nodes - 1}"
                     remedy = "correct the pair or raise nodes"
                 raise ScenarioError(f"edges[{k}]", rule, list(edge), remedy)
-            if edge[0] == edge[1]:
+            if ids[edge[0]] == ids[edge[1]]:  # 2 and "2" are one node
                 rule = "a link must join two nodes"
                 raise ScenarioError(f"edges[{k}]", rule, list(edge), "correct the pair")
         if not ids:
@@ -483,7 +483,7 @@ class Edges(Graph):
         repeated = len(links) - len(set(links))
         notes = (f"edges: {repeated} of {len(links)} pairs are listed again",) if repeated else ()
         return Topology(
-            tuple(sorted(ids.values())),
+            tuple(sorted(set(ids.values()))),
             tuple(sorted(set(links))),
             directed=self.directed,
             delivery=delivery,

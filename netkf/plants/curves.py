@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from netkf.core.fields import boolean, field, matrix, seconds
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, readonly_array
 from netkf.linalg.portable import apply
 from netkf.plants.changes import RateChange, matrices_of_pieces, schedule_of
 from netkf.plants.inputs import SineInput
@@ -56,7 +56,7 @@ class NonlinearDiffusion(NonlinearStates):
     @property
     def Q(self) -> FloatArray:
         """The covariance B B' (n, n) of the noise over a second, at first."""
-        return np.asarray(self.B @ self.B.T)
+        return readonly_array(self.B @ self.B.T)
 
     @property
     def noises(self) -> list[FloatArray]:

@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from netkf.core.fields import field, matrix, of_time, positive, square
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, readonly_array
 from netkf.linalg.spectra import balanced_norm, eigenvalues
 from netkf.plants.changes import DiffusionChange, matrices_of_pieces, schedule_of
 from netkf.plants.laws import GridLaws
@@ -69,7 +69,7 @@ class Diffusion(Plant):
     @cached_property
     def Q(self) -> FloatArray:
         """``B B'`` (n, n)."""
-        return np.asarray(self.B @ self.B.T)
+        return readonly_array(self.B @ self.B.T)
 
     @cached_property
     def laws(self) -> GridLaws:

@@ -188,6 +188,7 @@ def _components(
     return np.nonzero(np.isfinite(record.rows(node).y[numbers]))[1]
 
 
+@np.errstate(under="ignore")
 def held_out_errors(run: Run) -> list[dict[str, Any]]:
     """Return a row for each node of a ``run`` with a sensor that is ``held_out``, of its readings y
     minus H xhat of the node at their instants, after everything that happened until then; in slots

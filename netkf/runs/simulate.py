@@ -63,6 +63,7 @@ def require_scenario(value: object, function: str, rest: str = "", first: str = 
         raise ScenarioError("", f"{function} takes a netkf.Scenario", value, remedy)
 
 
+@np.errstate(under="ignore")
 def simulate(
     scenario: Scenario,
     seed: int | None = None,

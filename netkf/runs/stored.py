@@ -88,7 +88,7 @@ class StoredRun(WithPromises, Run):
     @cached_property
     def states(self) -> pd.DataFrame:
         """The table of state samples as the run wrote it."""
-        return self.stored
+        return self.stored.copy()
 
     @cached_property
     def fingerprint(self) -> str:

@@ -589,7 +589,7 @@ class ScenarioModel(Component):
             return self.probe
         count = int(np.rint(self.horizon / self.probe))
         times = self.time_grid.snap(self.probe * np.arange(count + 1))
-        return np.asarray(times[times <= self.horizon])
+        return readonly_array(times[times <= self.horizon])
 
     @property
     def slotted(self) -> bool:

@@ -378,12 +378,12 @@ def current_module(module_name: str, folder: Path) -> Iterator[None]:
     those that it imports: others of their names are removed, and all if one was edited.
     """
     names = module_name, *imports_beside(folder, module_name)
-    outdated = [name for name in names if _is_namesake(sys.modules.get(name), name, folder)]
+    outdated = {name for name in names if _is_namesake(sys.modules.get(name), name, folder)}
     present = _loaded_sources(names, folder)
     if any(_sources.get(file, text) != text for file, text in present.items()):
-        outdated = list(names)
-    for name in outdated:
-        sys.modules.pop(name, None)
+        outdated = {*names}
+    for name in _with_packages(outdated):
+        del sys.modules[name]
     if outdated:
         importlib.invalidate_caches()
     yield
@@ -397,25 +397,39 @@ def imported_source(file: Path) -> bytes:
 
 def edited_module(scenario: Component) -> Path | None:
     """Return the file of a module of a user's class that was edited since it was imported."""
-    files = (file for file in find_module_files(scenario).values() if file is not None)
+    modules = find_module_files(scenario)
+    files = [file for file in modules.values() if file is not None]
+    files += _loaded_sources(modules, getattr(scenario, "_folder", None) or Path.cwd())
     return next((f for f in files if not f.is_file() or f.read_bytes() != imported_source(f)), None)
 
 
 def _loaded_sources(names: Iterable[str], folder: Path) -> dict[Path, bytes]:
-    """Return what is in the files in ``folder`` of those modules that are loaded."""
-    files = [getattr(sys.modules.get(name), "__file__", None) for name in names]
-    paths = [Path(file).resolve() for file in files if file is not None]
-    here = [path for path in paths if path.parent == folder.resolve() and path.is_file()]
-    return {path: path.read_bytes() for path in here}
+    """Return what is in the files in ``folder`` of those modules, and all of their packages, that
+    are loaded.
+    """
+    here, sources = folder.resolve(), {}
+    for name in _with_packages(names):
+        file = Path(getattr(sys.modules[name], "__file__", None) or ".").resolve()
+        is_here = file.parent == here or file.is_relative_to(here / name.partition(".")[0])
+        if is_here and file.is_file():
+            sources[file] = file.read_bytes()
+    return sources
+
+
+def _with_packages(names: Iterable[str]) -> list[str]:
+    """Return the loaded ones of these modules, with all modules of their packages."""
+    tops = {name.partition(".")[0] for name in names} - {"netkf"}
+    return [name for name in [*sys.modules] if name.partition(".")[0] in tops]
 
 
 def _is_namesake(module: ModuleType | None, module_name: str, folder: Path) -> bool:
     """Return True if ``folder`` has a module of this name and the loaded one is not that file."""
-    file_in_folder = folder / f"{module_name}.py"
-    if module is None or not file_in_folder.exists():
+    path = folder.joinpath(*module_name.split("."))
+    here = [file for file in (path / "__init__.py", Path(f"{path}.py")) if file.is_file()]
+    if module is None or not here:
         return False
     file = getattr(module, "__file__", None)
-    return file is None or not Path(file).exists() or not file_in_folder.samefile(file)
+    return file is None or not Path(file).exists() or not here[0].samefile(file)
 
 
 def _installed_path(folder: Path) -> list[str]:

@@ -173,6 +173,7 @@ class FilterComparison(NotebookTable):
         return {**{name: getattr(self, name) for name in names}, "first": self.first, "rows": rows}
 
 
+@np.errstate(under="ignore")
 def compare_filters(
     scenario: Scenario,
     filters: Sequence[Choice],

@@ -340,6 +340,7 @@ class Consistency(NotebookTable):
         return pd.DataFrame([vars(row) for row in self.rows])
 
 
+@np.errstate(under="ignore")
 def consistency(
     scenario: Scenario,
     runs: int = 50,

@@ -177,6 +177,7 @@ class InnovationTests(NotebookTable):
         return pd.DataFrame([vars(row) for row in self.rows])
 
 
+@np.errstate(under="ignore")
 def innovations(run: Run | Scenario, confidence: float = 0.99) -> InnovationTests:
     """Test the innovations of each node of a ``run``, or of one that is simulated from a scenario.
     No true state is needed.

@@ -331,6 +331,7 @@ class NoiseFit(NotebookTable):
         return f"<netkf noise of {self.name!r}: {values}; log-likelihood +{gain:.4g}>"
 
 
+@np.errstate(under="ignore")
 def log_likelihood(scenario: Scenario, seed: int | None = None, replica: int = 0) -> float:
     """Return the log-likelihood of the readings of a ``replica`` after time 0, all sensors
     together, under the linear model that the filters believe, whatever the filter and the network:
@@ -349,6 +350,7 @@ def _central_model(scenario: Scenario, seed: int | None, replica: int) -> Centra
     return CentralModel(scenario, seed, integer(low=0)("replica", replica))
 
 
+@np.errstate(under="ignore")
 def fit_noise(
     scenario: Scenario, seed: int | None = None, replica: int = 0, confidence: float = 0.95
 ) -> NoiseFit:

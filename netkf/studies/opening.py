@@ -228,7 +228,8 @@ def open(directory: str | Path, *, trust: bool = False) -> Stored:
     Raises ScenarioError for whatever is not as netkf writes it.
     """
     folder = as_path("directory", directory, "name what netkf run or netkf sweep left")
-    name = shorten(directory)
+    # Traces are read later, when the current folder may be another.
+    name, folder = shorten(directory), folder.absolute()
     try:
         if not (folder / "manifest.json").exists() and (folder / "verdict.json").exists():
             document = read_checked_document(folder, "verdict.json", VERDICT)

@@ -13,6 +13,8 @@ from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import number, one_of, require_runs
 from netkf.core.notebook import NotebookTable
@@ -361,6 +363,7 @@ class Search:
         return f"{certainty}; taken to be monotone, as it was {tried}"
 
 
+@np.errstate(under="ignore")
 def size(
     scenario: Scenario,
     key: str,

@@ -51,6 +51,7 @@ SHOWN = 20  # instants at which truths are compared
 Row = dict[str, Any]
 
 
+@np.errstate(under="ignore")
 def sweep(
     scenario: Scenario,
     vary: Mapping[str, Sequence[Any]],

@@ -446,3 +446,20 @@ def test_a_module_that_was_edited_is_imported_anew(folder, edited):
     (folder / f"{edited}.py").write_text("from netkf.parts import Hybrid\n" + changed)
     assert netkf.load(file).filter.algorithm.own == 6.0
     assert first.filter.algorithm.own == 2.0
+
+
+@pytest.mark.parametrize("kind", ["evil:P", "evil.deep:P"])
+def test_packages_in_the_folder_are_as_modules_there(folder, tmp_path, kind):
+    """Edited inner modules were not seen, and a second folder got the package of the first."""
+    text = "from netkf.parts import Hybrid\n\n\nclass P(Hybrid):\n    own = {}\n"
+    for place, own in ((folder, 1.0), (tmp_path / "other", 2.0)):
+        module(place / "evil" / "__init__.py", "from evil.deep import P\n")
+        (place / "evil" / "deep.py").write_text(text.format(own))
+        file = scenario(place, kind)
+        assert netkf.load(file).filter.algorithm.own == own
+    (place / "evil" / "deep.py").write_text(text.format(3.0))
+    again = netkf.load(file)
+    assert again.filter.algorithm.own == 3.0
+    (place / "evil" / "deep.py").write_text(text.format(4.0))
+    with pytest.raises(netkf.EngineError, match=r"deep.py, which was edited since the scenario"):
+        pack_scenario(again)

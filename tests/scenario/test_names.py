@@ -338,6 +338,11 @@ def test_edges_of_a_graph_must_agree():
         )
     with pytest.raises(netkf.ScenarioError, match="two nodes have one name"):
         netkf.network.graph_files.from_networkx(networkx.Graph([(1, "1")]))
+    with pytest.raises(netkf.ScenarioError, match="two nodes have one name"):
+        netkf.network.graph_files.from_networkx(networkx.Graph([("b", " b ")]))
+    for nodes in (None, [2, "2"]):
+        with pytest.raises(netkf.ScenarioError, match="a link must join two nodes"):
+            netkf.parts.Edges(edges=[[2, "2"]], nodes=nodes).build(0)
 
 
 def test_sensors_without_nodes_have_those_of_their_table_by_the_names_of_the_graph(folder):

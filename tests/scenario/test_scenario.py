@@ -93,6 +93,12 @@ def test_a_scenario_knows_its_folder_in_any_current_folder(tmp_path, monkeypatch
     assert netkf.save(netkf.simulate(again), again, "run").is_dir()
 
 
+def test_arrays_of_a_scenario_are_read_only(ring):
+    for array in (ring.times, ring.plant.Q, ring.plant.A):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 2.0
+
+
 def test_a_class_of_the_user_needs_no_registration(tmp_path, monkeypatch, ring):
     (tmp_path / "fusion.py").write_text(
         textwrap.dedent(

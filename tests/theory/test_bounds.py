@@ -10,6 +10,7 @@ import scipy.linalg
 import netkf
 from netkf import theory
 from netkf.theory.hybrid import bounds
+from tests.conftest import SCENARIOS
 
 
 def plain_bound(A, Q, G, c, P0, times):
@@ -35,6 +36,13 @@ def plain_bound(A, Q, G, c, P0, times):
         f, (0, times[-1]), np.concatenate([P0.ravel()] * N), "Radau", times, rtol=1e-10, atol=1e-12
     )
     return solved.y.T.reshape(len(times), N, n, n)
+
+
+def test_whether_numpy_raises_at_underflow_does_not_matter():
+    scenario = netkf.load(SCENARIOS / "delayed_links.toml")
+    expected = theory.covariance_bound(scenario, scenario.times)
+    with np.errstate(all="raise"):
+        assert (theory.covariance_bound(scenario, scenario.times) == expected).all()
 
 
 def test_directions_that_lose_differently_enter_as_directed_rates(build, tmp_path):

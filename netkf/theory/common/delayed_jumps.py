@@ -35,6 +35,7 @@ from netkf.linalg.arrays import FloatArray, symmetric
 from netkf.linalg.spectra import contracts, growth_factor
 from netkf.theory.common.jumps import ClockJumps, LyapunovInverse
 from netkf.theory.common.random_links import Directions
+from netkf.theory.numerics.matrices import arnoldi_start
 
 MIN_POINTS, MAX_POINTS, POINTS_PER_CHANGE = 12, 80, 1.2
 """Limits of the number of intervals between the collocation points of a delay, and how many more
@@ -304,7 +305,7 @@ class DelayedJumps:
             dense = np.stack([next_means(unit) for unit in np.eye(size)], axis=1)
             return contracts(growth_factor(dense))
         operator = scipy.sparse.linalg.LinearOperator((size, size), matvec=next_means)
-        start = np.random.default_rng(0).uniform(-1.0, 1.0, size)  # else scipy draws another
+        start = arnoldi_start(size)
         values = scipy.sparse.linalg.eigs(operator, k=4, v0=start, return_eigenvectors=False)
         return contracts(float(np.abs(values).max()))
 

@@ -27,14 +27,19 @@ which are those of the plant after all its changes.
 
 
 def guard_functions(functions: dict[str, Any]) -> dict[str, Any]:
-    """Return ``functions`` by name, each of which refuses anything but a Scenario first."""
+    """Return ``functions`` by name: whose first argument is a Scenario refuses anything else, and
+    none fails because numpy is told to raise at underflow.
+    """
     wrapped = {}
     for name, function in functions.items():
         if inspect.isfunction(function):
             first = next(iter(inspect.signature(function).parameters.values()), None)
             # Modules postpone the evaluation of annotations (PEP 563), so that they are strings.
-            if first is not None and first.annotation == "Scenario":
-                wrapped[name] = _check_first_argument(name, function)
+            of_scenario = first is not None and first.annotation == "Scenario"
+            safe = _check_first_argument(name, function) if of_scenario else function
+            wrapped[name] = np.errstate(under="ignore")(safe)
+            # Pickle finds a function by these two names: the wrapper replaces the original there.
+            wrapped[name].__module__, wrapped[name].__qualname__ = "netkf.theory", name
     return wrapped
 
 
@@ -85,6 +90,4 @@ def _check_first_argument(name: str, function: Callable[..., Any]) -> Callable[.
         with explain_failures(scenario):
             return function(scenario if name in WITH_TIME else scenario.last_piece, *args, **kwargs)
 
-    # Pickle finds a function by these two names: the wrapper replaces the original under them.
-    checked.__module__, checked.__qualname__ = "netkf.theory", name
     return checked

@@ -31,6 +31,13 @@ MAX_STATES = 6
 """States up to which equations are solved by numpy alone: to import scipy.linalg takes longer."""
 
 
+def arnoldi_start(size: int) -> FloatArray:
+    """Return the vector (size,) with which Arnoldi's method begins: else scipy draws another in
+    every call.
+    """
+    return np.random.default_rng(0).uniform(-1.0, 1.0, size)
+
+
 def as_numbers(name: str, value: ArrayLike) -> FloatArray:
     """Return ``value`` as a float array, a number as (1, 1); a TheoryError calls it ``name``."""
     try:
