@@ -11,7 +11,7 @@ import re
 from dataclasses import dataclass, field
 from decimal import Decimal
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -218,7 +218,23 @@ def _find_interval(numbers: FloatArray, times: FloatArray) -> float:
     first = np.flatnonzero(np.diff(times, prepend=-np.inf) > 0.0)
     steps, gaps = np.diff(numbers[first]), np.diff(times[first])
     forward = (steps > 0) & (steps < MAX_SKIP)
-    return float(np.median(gaps[forward] / steps[forward])) if forward.any() else 0.0
+    if not forward.any():
+        return 0.0
+    gaps, steps = gaps[forward], steps[forward]
+    # Without pauses; a median alone would be a multiple of what stamps resolve.
+    usual = gaps <= 2.0 * np.median(gaps / steps) * steps
+    return float(gaps[usual].sum() / steps[usual].sum())
+
+
+class _Counting(NamedTuple):
+    """How a sender counts: ``modulus``, ``cycle`` (the same if it wraps, else 0), ``late`` (how far
+    numbers fall out of order), ``slack`` (packets that one stamp may hide).
+    """
+
+    modulus: int
+    cycle: int
+    late: int
+    slack: float
 
 
 def unwrap(numbers: np.ndarray, times: FloatArray) -> tuple[np.ndarray, int, int, int]:
@@ -235,27 +251,29 @@ def unwrap(numbers: np.ndarray, times: FloatArray) -> tuple[np.ndarray, int, int
     # Where one stamp has several packets, more may have been sent since than it shows.
     coarse = bool(((gaps == 0.0) & (np.diff(numbers) != 0)).any()) and bool((gaps > 0.0).any())
     grain = float(gaps[gaps > 0.0].min()) if coarse else 0.0
+    cycle = modulus if (np.diff(numbers) < -0.5 * modulus).any() else 0
+    late = _find_late(numbers, times, modulus) if coarse else LATE
+    counting = _Counting(modulus, cycle, late, grain / interval if interval else 0.0)
     ends, numbers = np.searchsorted(times, times, "right"), numbers.copy()
     place: list[int] = []
     counters = np.empty(len(numbers), dtype=np.int64)
     offset = wraps = restarts = top = last = 0
-    cycle = modulus if (np.diff(numbers) < -0.5 * modulus).any() else 0
     top_time = 0.0
     for k, time in enumerate(times.tolist()):
         if k == len(place):
-            turn = _begin_at(numbers[k : ends[k]], last - LATE if k else None, modulus)
+            turn = _begin_at(numbers[k : ends[k]], last - late if k else None, modulus)
             place += (k + turn).tolist()
             numbers[k : ends[k]] = numbers[k : ends[k]][turn]
         number = int(numbers[k])
         expected = (time + grain - top_time) / interval if interval and k else 0.0
         coming = numbers[k : k + 8]
-        begun = _cycles_begun(coming, last, expected, modulus, cycle, wraps > 0) if k else 0
+        begun = _cycles_begun(coming, last, expected, counting, wraps > 0) if k else 0
         if begun == RESTART:
             offset, restarts = top + 1 - number, restarts + 1
         else:
             offset, wraps = offset + begun * modulus, wraps + begun
         # One of before the wrap may come late, but not after as much time as it is ahead.
-        is_late = wraps and not begun and number - last > max(0.5 * modulus, 2.0 * expected)
+        is_late = k and cycle and not begun and number - last > max(0.5 * modulus, 2.0 * expected)
         counter = number + offset - (modulus if is_late else 0)
         counters[place[k]] = counter
         if not k or counter > top:
@@ -263,27 +281,40 @@ def unwrap(numbers: np.ndarray, times: FloatArray) -> tuple[np.ndarray, int, int
     return counters, wraps, modulus, restarts
 
 
+def _find_late(numbers: np.ndarray, times: FloatArray, modulus: int) -> int:
+    """Return how far numbers may fall from one coarse stamp to the next, where the clocks of those
+    who report them differ: twice as far as usual, if they fall often.
+    """
+    first = np.flatnonzero(np.diff(times, prepend=-np.inf) > 0.0)
+    falls = np.maximum.reduceat(numbers, first)[:-1] - np.minimum.reduceat(numbers, first)[1:]
+    falls = falls[(falls > 0) & (falls < 0.25 * modulus)]
+    return max(LATE, int(2 * np.median(falls))) if 10 * len(falls) > len(first) else LATE
+
+
 def _cycles_begun(
-    coming: np.ndarray, last: int, expected: float, modulus: int, cycle: int, wrapped: bool
+    coming: np.ndarray, last: int, expected: float, counting: _Counting, wrapped: bool
 ) -> int:
     """Return how many cycles began between ``last`` and ``coming``; RESTART if it began anew."""
-    number = int(coming[0])
+    number, modulus, least = int(coming[0]), counting.modulus, last - counting.late
     skipped = number + modulus - last
-    turns = _whole_turns(skipped, expected, cycle)
+    turns = _whole_turns(skipped, expected, counting)
     is_due = modulus > 0 and (turns or abs(skipped - expected) <= 1.0 + 0.25 * expected)
-    falls = number < last - LATE and np.median(coming) < last - LATE
+    # After a whole cycle nothing is late any more.
+    is_due |= expected > counting.cycle > 0
+    falls = number < least and np.median(coming) < least
     if falls or (number <= last and is_due):
         return 1 + turns if modulus and skipped <= 2.0 * expected + 3.0 else RESTART
     if MAX_SKIP < number - last > 10.0 * expected and not wrapped:
         return RESTART
-    return _whole_turns(number - last, expected, cycle) if number > last + 1 else 0
+    return _whole_turns(number - last, expected, counting) if number > last + 1 else 0
 
 
-def _whole_turns(step: int, expected: float, cycle: int) -> int:
-    """Return how many ``cycle`` beside ``step`` packets fit a time of ``expected`` ones well."""
-    turns = round((expected - step) / cycle) if cycle else 0
-    off = abs(step + turns * cycle - expected)
-    return max(turns, 0) if off <= min(1.0 + 0.05 * expected, 0.25 * cycle) else 0
+def _whole_turns(step: int, expected: float, counting: _Counting) -> int:
+    """Return how many cycles beside ``step`` packets fit a time of ``expected`` ones well."""
+    cycle, slack, middle = counting.cycle, counting.slack, expected - counting.slack
+    turns = round((middle - step) / cycle) if cycle else 0
+    off = abs(step + turns * cycle - middle)
+    return max(turns, 0) if off <= min(1.0 + slack + 0.05 * middle, 0.25 * cycle) else 0
 
 
 def _begin_at(numbers: np.ndarray, first: int | None, modulus: int) -> np.ndarray:
@@ -302,13 +333,20 @@ def note_count(notes: list[str], count: float, what: str, text: str) -> None:
         notes.append(text.replace("{}", count_phrase(int(count), what), 1))
 
 
+def _time_to_next(t: pd.Series) -> Any:
+    stamps = np.append(np.unique(t), np.inf)
+    return stamps[np.searchsorted(stamps, t, "right")] - t
+
+
 def spread_equal(sends: pd.DataFrame, resolution: float, notes: list[str]) -> None:
     """Move transmissions of a sender with one stamp apart, within ``resolution`` (s)."""
     key = [sends["sender"], sends["to"], sends["t"]]
     rank, size = sends.groupby(key).cumcount(), sends.groupby(key)["t"].transform("size")
     moved = int((rank > 0).sum())
     if moved:
-        sends["t"] += (rank / size * resolution).round(9)
+        # Where clocks were aligned, the next stamp may be nearer than the resolution.
+        room = sends.groupby(["sender", "to"])["t"].transform(_time_to_next)
+        sends["t"] += (rank / size * np.fmin(room, resolution)).round(9)
         notes.append(
             f"moved: {count_phrase(moved, 'transmission')} that had the stamp of another one of "
             f"the sender, by less than the resolution of {resolution:g} s, in their order"

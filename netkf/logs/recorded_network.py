@@ -163,8 +163,8 @@ def rename_nodes(log: PacketLog, known: set[str]) -> None:
     changed = {a: b for a, b in names.items() if a != b and a not in kept}
     if not changed:
         return
-    listed = ", ".join(f"{a} is {b}" for a, b in list(changed.items())[:5])
-    log.notes.append(f"used: nodes have other names here: {listed}{', ...' * (len(changed) > 5)}")
+    listed = ", ".join(f"{a} is {b}" for a, b in changed.items())
+    log.notes.append(f"used: nodes have other names here: {listed}")
     log.sends[["sender", "to"]] = log.sends[["sender", "to"]].replace(changed)
     log.outcomes["receiver"] = log.outcomes["receiver"].replace(changed)
     for table in (log.positions, log.readings):

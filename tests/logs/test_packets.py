@@ -13,7 +13,7 @@ import pytest
 import netkf
 from netkf.cli.main import main
 from netkf.core.errors import ScenarioError
-from netkf.logs.packets import choose_origin, find_lead, unwrap
+from netkf.logs.packets import choose_origin, find_lead, spread_equal, unwrap
 from netkf.scenario.reading import from_table
 from netkf.scenario.writing import as_table, to_toml
 from tests.conftest import SCENARIOS
@@ -201,6 +201,15 @@ def test_names_that_tables_cannot_hold_are_others(tmp_path):
     assert set(netkf.load(scenario).topology.names) == {"n0", "n1"}
 
 
+def test_every_node_with_another_name_is_listed(tmp_path):
+    rows = ["t,src,dst,seq", *(f"{k},hut {k},hut_{k},0" for k in range(1, 9))]
+    _, notes = netkf.import_log(write(tmp_path / "log.csv", rows), "csv", tmp_path / "out")
+    (listed,) = (n.partition("here: ")[2] for n in notes if "other names" in n)
+    names = dict(pair.split(" is ") for pair in listed.split(", "))
+    assert set(names) == {f"hut{mark}{k}" for mark in " _" for k in range(1, 9)}
+    assert set(names.values()) == set(netkf.load(tmp_path / "out" / "scenario.toml").topology.names)
+
+
 def test_a_silent_receiver_has_a_hole_if_others_hear(tmp_path):
     """Nodes 0, 1, 2 hear all of 400 packets of 3 and 4, but for a stretch of node 2, of all, and of
     one sender at node 1.
@@ -320,6 +329,44 @@ def test_stamps_may_be_coarse_and_clocks_apart(tmp_path, modulus, interval, stam
     assert {link: own.tolist() for link, own in outcomes} == true
     sent = table(tmp_path / "out", "transmissions.csv").groupby("node")["t"]
     assert all(own.is_unique for _, own in sent)
+
+
+@pytest.mark.parametrize("modulus", [256, 65536])
+@pytest.mark.parametrize("lead", [0.3, 1.5])
+def test_coarse_stamps_of_clocks_that_are_apart_are_one_count(tmp_path, modulus, lead):
+    """Ten packets have one stamp, which two receivers give to other tens."""
+    random, ahead = np.random.default_rng(2), np.array([0.0, 1.0, -1.0]) * lead
+    rows, first = ["t,src,dst,seq"], modulus - 40 * (modulus == 256)
+    heard = random.random((300, 3)) < 0.7
+    heard[[0, -1]] = True
+    for k, j in zip(*np.nonzero(heard), strict=True):
+        rows.append(f"{int(1000 + 0.1 * k + ahead[j])},s,{j},{(first + k) % modulus}")
+    netkf.import_log(write(tmp_path / "log.csv", rows), "csv", tmp_path / "out", hole=1e9)
+    accounts = table(tmp_path / "out", "accounts.csv").set_index("receiver")
+    assert accounts["sent"].tolist() == [300] * 3
+    outcomes = table(tmp_path / "out", "outcomes.csv")
+    for j, own in outcomes[outcomes["delivered"] == 1].groupby("receiver"):
+        assert own["message"].tolist() == np.flatnonzero(heard[:, int(str(j)[-1])]).tolist()
+
+
+def test_transmissions_of_one_stamp_stay_before_the_next_where_clocks_were_aligned():
+    sends = pd.DataFrame({"sender": "a", "to": "", "t": [1.2, 1.2, 1.2, 1.5, 1.5, 4.0]})
+    spread_equal(sends, 1.0, [])
+    assert sends["t"].is_monotonic_increasing
+    np.testing.assert_allclose(sends["t"], [1.2, 1.3, 1.4, 1.5, 2.0, 4.0])
+
+
+def test_the_interval_is_finer_than_the_stamps():
+    """A packet each 2.5 s with stamps of whole seconds, and 400 of which nobody heard."""
+    true = np.array([*range(1000), *range(1400, 2000)])
+    counters, *_ = unwrap(true % 256, np.floor(2.5 * true))
+    assert (np.diff(counters) == np.diff(true)).all()
+
+
+def test_after_a_whole_cycle_nothing_is_late():
+    true = np.array([*range(40), *range(101, 140)])  # 37 follows 39, 62 packets later
+    counters, _, _, restarts = unwrap(true % 16, true + 5.0 * (true > 100))
+    assert (np.diff(counters).min(), restarts) == (1, 0)
 
 
 def test_clocks_that_are_near_each_other_in_two_parties_are_told_apart():
