@@ -214,8 +214,11 @@ def find_lead(numbers: FloatArray, times: FloatArray, who: np.ndarray) -> FloatA
 
 
 def _find_interval(numbers: FloatArray, times: FloatArray) -> float:
-    """Return the usual time between two packets, by the first of each stamp; 0 if none follow."""
-    first = np.flatnonzero(np.diff(times, prepend=-np.inf) > 0.0)
+    """Return the usual time between two packets, by the first of each stamp and number; 0 if none
+    follow.
+    """
+    is_new = np.diff(numbers, prepend=-1) != 0
+    first = np.flatnonzero(is_new & (np.diff(times, prepend=-np.inf) > 0.0))
     steps, gaps = np.diff(numbers[first]), np.diff(times[first])
     forward = (steps > 0) & (steps < MAX_SKIP)
     if not forward.any():
