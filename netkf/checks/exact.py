@@ -142,7 +142,7 @@ def _exact_statistics(
     floor = np.maximum((BLUR * run.rounding) ** 2, _variance_floor(scenario))
     joint, bias = _pool_times(centred, law.covariance, float(floor.max()))
     pooled = {
-        "whole": whiten_errors(centred[at], stacked[at], MIN_VARIANCE, floor[at]),
+        "whole": whiten_errors(centred[at], stacked[at], floor[at]),
         "joint": joint,
         "quadratic": _pool_nees(centred, run.P[:, :M], law),
         "bias": bias,
@@ -221,16 +221,14 @@ def few_errors(scenario: Scenario) -> Assumption:
     return Assumption("exact errors are within reach", "netkf", holds, evidence)
 
 
-def whiten_errors(
-    e: FloatArray, stacked: FloatArray, min_variance: float, floor: FloatArray | float = 0.0
-) -> FloatArray:
+def whiten_errors(e: FloatArray, stacked: FloatArray, floor: FloatArray | float) -> FloatArray:
     """Return ``e' Sigma^-1 e`` and its degrees of freedom, (K, 2), of errors less their mean ``e``
     (K, N, n) with joint covariances ``stacked`` (K, N n, N n). Directions count if their variance
-    is above ``min_variance`` times the largest one and above ``floor`` (K,).
+    is above MIN_VARIANCE times the largest one and above ``floor`` (K,).
     """
     finite = np.asarray(np.isfinite(stacked).all(axis=(-1, -2)))
     values, vectors = np.linalg.eigh(np.where(finite[:, None, None], stacked, 0.0))
-    counted = (values > min_variance * values[:, -1:]) & (values > np.reshape(floor, (-1, 1)))
+    counted = (values > MIN_VARIANCE * values[:, -1:]) & (values > np.reshape(floor, (-1, 1)))
     components = np.einsum("kab,ka->kb", vectors, e.reshape(len(e), -1))
     square = np.where(counted, components**2 / np.where(counted, values, 1.0), 0.0).sum(axis=1)
     return np.stack([square, counted.sum(axis=1)], axis=1)
@@ -319,9 +317,9 @@ def check_error_covariance(samples: RunSamples, level: float) -> Finding:
     if np.isnan(e).all():
         return find_nothing(NEES_TOLERANCE)
     # Each node and time by itself: N = 1. Directions without variance have no degree of freedom.
-    single = whiten_errors(
-        e.reshape(-1, 1, n), Sigma.reshape(-1, n, n), MIN_VARIANCE, _variance_floor(scenario)
-    ).reshape(len(e), -1, 2)
+    floor = _variance_floor(scenario)
+    single = whiten_errors(e.reshape(-1, 1, n), Sigma.reshape(-1, n, n), floor)
+    single = single.reshape(len(e), -1, 2)
     squares = np.concatenate([single, all_nodes], axis=1)
     freedom = np.nan_to_num(squares[..., 1]).sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):

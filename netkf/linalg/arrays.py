@@ -103,8 +103,8 @@ def symmetric(matrices: FloatArray) -> FloatArray:
     return np.asarray(0.5 * (matrices + np.swapaxes(matrices, -1, -2)))
 
 
-def is_semidefinite(matrix: FloatArray, tolerance: float = 1e-10) -> bool:
-    """Return True if no eigenvalue of a symmetric ``matrix`` (n, n) is below -tolerance times its
+def is_semidefinite(matrix: FloatArray) -> bool:
+    """Return True if no eigenvalue of a symmetric ``matrix`` (n, n) is below -1e-10 times its
     largest, and none below -1e-5 in units of the rows in which the diagonal is 1.
     """
     sizes = np.diagonal(matrix)
@@ -115,10 +115,10 @@ def is_semidefinite(matrix: FloatArray, tolerance: float = 1e-10) -> bool:
     least = np.linalg.eigvalsh(matrix / units[:, None] / units)[0]
     if sizes.min() < -rounding or not least >= -1e-5:
         return False
-    if least >= -tolerance:
+    if least >= -1e-10:
         return True  # in units of the largest row too
     values = np.linalg.eigvalsh(matrix)
-    return bool(values[0] >= -tolerance * abs(values[-1]))
+    return bool(values[0] >= -1e-10 * abs(values[-1]))
 
 
 def is_definite(matrices: FloatArray) -> NDArray[np.bool_]:

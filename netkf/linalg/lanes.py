@@ -59,14 +59,14 @@ def with_spare(shape: tuple[int, ...], make: Callable[[tuple[int, ...]], Any] = 
     return make((entries + LANES * LANES,))[:entries].reshape(shape)
 
 
-def blocks_of(runs: int, lanes: int = LANES) -> int:
-    """Return the number of blocks of ``lanes`` for the ``runs``; the last may have idle lanes."""
-    return -(-runs // lanes)
+def blocks_of(runs: int) -> int:
+    """Return the number of blocks of lanes for the ``runs``; the last may have idle lanes."""
+    return -(-runs // LANES)
 
 
-def in_lanes(values: FloatArray, blocks: int, lanes: int = LANES) -> FloatArray:
-    """Return an array (blocks, ..., lanes) with the same ``values`` (...) in each lane."""
-    made: FloatArray = aligned((blocks, *values.shape, lanes))
+def in_lanes(values: FloatArray, blocks: int) -> FloatArray:
+    """Return an array (blocks, ..., L) with the same ``values`` (...) in each lane."""
+    made: FloatArray = aligned((blocks, *values.shape, LANES))
     made[:] = values[..., None]
     return made
 

@@ -68,7 +68,7 @@ class SlotRun(Struct):
     """The surroundings of H nodes in slots, L runs side by side, with W directed links.
 
     size, lanes : n and L as lengths (``linalg.structs``, ``linalg.lanes``)
-    model : SlotTables
+    model : SlotModelArrays
     first, sender, weight : links to node h are ``first[h]`` to ``first[h + 1]`` - 1: the index of
                             the sender, and the weight that the receiver gives it
     opposite : the link from the receiver of each link to its sender, -1 if there is none

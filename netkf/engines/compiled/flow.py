@@ -432,12 +432,8 @@ class FlowRun:
             return True
         times = state.probes[state.probe_at - count : state.probe_at].copy()
         local, x = self._draws.states.states(times)
-        # Index of the last sample that counts: the last one, or the first that is not finite. A
-        # list, so that the function below can set it.
-        last = [count - 1]
 
         def pass_rows_on(k: int) -> None:
-            last[0] = k
             self._record_rows(int(buffer.rows[0, k]), buffer.counts[0, k])
 
         # Copies: the loop writes the next samples into the same space.
@@ -449,8 +445,9 @@ class FlowRun:
             xhat += self._scenario.origins(times, local, x)[:, entries]
         xhat, P, error = by_node(self._scenario, xhat, P, error)
         samples = StateSamples(times, x, xhat, P, error)
-        run = self._scenario, self._recorder, self._progress
-        finite = record_samples(*run, samples, pass_rows_on)
+        finite = record_samples(
+            self._scenario, self._recorder, self._progress, samples, pass_rows_on
+        )
         if self._clocked is not None:
             self._recorder.sums = self._clocked.sums()
         return finite

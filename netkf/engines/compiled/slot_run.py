@@ -18,7 +18,6 @@ import numpy as np
 
 from netkf.algorithms.filter import compiled_kernels
 from netkf.algorithms.kernels.nonlinear_rows import NonlinearRows, add_values
-from netkf.algorithms.kernels.pairs import Pairs
 from netkf.core.memory import ReusableMemory, keep_freed_memory
 from netkf.engines.base import Progress
 from netkf.engines.compiled.gates import with_clips, with_refusals
@@ -136,22 +135,19 @@ class SlotRuns:
         self._total = aligned((blocks, LANES))
         kernels = compiled_kernels(setup.algorithm, clocked=False)
         assert kernels is not None
-        self._pairs: Pairs | None = None
-        if setup.pairs is not None:
-            method = scenario.filter.linearise
-            self._pairs = setup.pairs.tables(method, min(runs, LANES))
-        active = min(runs, LANES)
+        method, active = scenario.filter.linearise, min(runs, LANES)
+        self._pairs = None if setup.pairs is None else setup.pairs.tables(method, active)
         self._filters = SlotFilters(setup, kernels, blocks, active=active, pairs=self._pairs)
-        arrays, never = self._filters.records.arrays, (blocks, setup.estimators, LANES)
-        # NEVER: a slot that no run reaches, for a node that never stops.
         self._nonlinear: NonlinearRows | None = None
         if setup.nonlinear is not None:
-            method, active = scenario.filter.linearise, min(runs, LANES)
             self._nonlinear = self._drawn = setup.nonlinear.tables(method, active)
             if setup.drawn is not setup.nonlinear:
                 self._drawn = setup.drawn.tables(method, active)
             self._filters.set_rows(self._nonlinear)
-        self._stopped = arrays.get("stopped", np.full(never, NEVER))
+        arrays = self._filters.records.arrays
+        # A node that never stops does so in a slot that no run reaches.
+        never = np.full((blocks, setup.estimators, LANES), NEVER)
+        self._stopped = arrays.get("stopped", never)
         self._conserved = arrays.get("conserved", aligned((blocks, setup.estimators, 2, LANES)))
         if setup.conserved_names:
             self._filters.observe()
@@ -257,7 +253,6 @@ class SlotRuns:
         """Simulate the next slots in all R runs, with about ``max_events`` events at most (0: no
         limit). ``timed``: compute the times of slots, which event rows need.
         """
-        self._max_events = max_events
         times, messages = self._next_messages(max_events, timed)
         local, absolute, rebased = self._next_states(len(times.start))
         drawn, responses = self._path is not None, self._scenario.input_responses
@@ -273,11 +268,10 @@ class SlotRuns:
             **self._filters.sample_scratch,
             entries=np.maximum(self.setup.entries, 0) if self.setup.views is not None else _ALL,
         )  # fmt: skip
-        slots = times.first + sampled
         decided = self._simulate(times, messages, (y, H, rebased), kernel_samples)
         if not drawn and responses is not None and responses.believed is not None:
             # Recorded states may be unknown, where coordinates begin is not.
-            moved = responses.believed.states(slots)[:, self.setup.entries]
+            moved = responses.believed.states(times.first + sampled)[:, self.setup.entries]
             samples.xhat[:, times.sample[sampled]] += moved
         return SlotBlock(sampled, samples, times, messages, *decided)
 

@@ -19,7 +19,7 @@ from netkf.engines.simpy.clocks import clock_processes
 from netkf.engines.simpy.driven import DrivenModel
 from netkf.engines.simpy.nodes import ClockedNode, Node, View, distinct
 from netkf.engines.simpy.sensors import increment_sensors, sensor_processes
-from netkf.engines.simpy.slots import FIRST_RANK, Reader, SlotClock, SlotNode, SlotSchedule
+from netkf.engines.simpy.slots import FIRST_RANK, SlotClock, SlotNode, SlotSchedule
 from netkf.engines.simpy.timeline import Process, Timeline
 from netkf.engines.simpy.transmission import Transmitter
 from netkf.engines.soundness import sound_mask, stack_estimates
@@ -27,10 +27,12 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.plain import announce_plain
 from netkf.network.lives import Lifetime, lifetimes
 from netkf.network.node_clocks import node_time
+from netkf.plants.linear import Readings
+from netkf.plants.readings import readings_of
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
-from netkf.trace.schema import CODES
+from netkf.trace.schema import CODES, SENSE
 
 
 class DivergedError(Exception):
@@ -106,8 +108,8 @@ class _Simulation:
             clock, response = node_time(scenario, streams, node), None
             if scenario.network.clocks and scenario.input_responses is not None:
                 response = scenario.input_responses.believed
-            common = (timeline, self._recorder, truth, sensors, clock, response)
-            return ClockedNode(*common, *_identify(scenario, node, entity, clock.shows(0.0)))
+            own = _node_arguments(scenario, node, entity, clock.shows(0.0))
+            return ClockedNode(timeline, self._recorder, truth, sensors, clock, response, **own)
 
         nodes = _nodes(scenario, make_node)
         self._begin_origins(nodes)
@@ -184,8 +186,8 @@ class _Simulation:
         schedule, period = SlotSchedule(scenario), scenario.slot_plant.period
 
         def make(node: int, entity: int, _: tuple[int, ...]) -> SlotNode:
-            own = _identify(scenario, node, entity)
-            return SlotNode(recorder, schedule, period, streams, *own)
+            own = _node_arguments(scenario, node, entity)
+            return SlotNode(recorder, schedule, period, streams, **own)
 
         nodes = _nodes(scenario, make)
         self._begin_origins(nodes)
@@ -200,13 +202,36 @@ class _Simulation:
                 )
                 for sensor in placed
             ]
-            entity = scenario.topology.index[node]
-            reader = Reader(recorder, schedule, node, entity, nodes[node], self._membership.up)
-            processes.append(reader.run_process(self.timeline, truth, sensors))
+            processes.append(self._reading_slots(truth, schedule, node, nodes[node], sensors))
         if scenario.node_filter.timing.talks:
-            shared = (scenario, streams, recorder, schedule, self._transmitter, nodes)
-            processes.append(SlotClock(*shared).run_process(self.timeline))
+            clock = SlotClock(scenario, streams, recorder, schedule, self._transmitter, nodes)
+            processes.append(clock.run_process(self.timeline))
         return [self._sampling_slots(truth, schedule, nodes, _Sums(distinct(nodes))), *processes]
+
+    def _reading_slots(
+        self,
+        truth: Any,
+        schedule: SlotSchedule,
+        node: int,
+        carrier: SlotNode,
+        sensors: list[tuple[Readings, FloatArray]],
+    ) -> Process:
+        """Read all ``sensors`` of a node, each with the R (p, p) that its filter believes."""
+        slot, entity = 0, self._scenario.topology.index[node]
+        while schedule.runs(slot):
+            for stage in schedule.stages(slot):
+                if stage.kind == "read":
+                    yield self.timeline.at(stage.time, stage.rank, entity)
+                    up = self._membership.up(node)
+                    if up:
+                        self._recorder.append((stage.time, SENSE, node, -1, -1, -1, NAN))
+                    # In the coordinates of the estimates, as H x is.
+                    x = truth.local(slot)
+                    for sensor, R in sensors:
+                        for reading in readings_of(sensor, slot, x, R):
+                            if up:
+                                carrier.read(node, *reading)
+            slot += 1
 
     def _sampling_slots(
         self, truth: Any, schedule: SlotSchedule, nodes: dict[int, SlotNode], sums: _Sums
@@ -318,7 +343,7 @@ def _nodes(scenario: Scenario, make: Callable[[int, int, tuple[int, ...]], Any])
     return {node: make(node, entity, (node,)) for entity, node in enumerate(nodes)}
 
 
-def _identify(scenario: Scenario, node: int, entity: int, start: float = 0) -> tuple[Any, ...]:
+def _node_arguments(scenario: Scenario, node: int, entity: int, start: float = 0) -> dict[str, Any]:
     """Return the arguments of Node for ``node`` (id, -1: pooled) with index ``entity``, whose clock
     shows ``start`` seconds, or slots, at time 0.
     """
@@ -334,17 +359,18 @@ def _identify(scenario: Scenario, node: int, entity: int, start: float = 0) -> t
     if isinstance(model, MapModel | RateModel):
         # It follows the time of one run.
         model = dataclasses.replace(model)
-    return (
-        scenario.node_filter,
-        node,
-        entity,
-        model,
-        scenario.fresh_estimate(scenario.nodes[entity], start),
-        scenario.node_infos[entity],
-        spread_of(scenario.filter.linearise, scenario.plant.n if view is None else len(view)),
-        None if view is None else View(view, scenario.layout.places, common),
-        scenario.filter.gate,
-    )
+    states = scenario.plant.n if view is None else len(view)
+    return {
+        "algorithm": scenario.node_filter,
+        "node": node,
+        "entity": entity,
+        "model": model,
+        "start": scenario.fresh_estimate(scenario.nodes[entity], start),
+        "info": scenario.node_infos[entity],
+        "points": spread_of(scenario.filter.linearise, states),
+        "view": None if view is None else View(view, scenario.layout.places, common),
+        "gate": scenario.filter.gate,
+    }
 
 
 class _Sums:

@@ -106,7 +106,7 @@ class View:
             elif isinstance(part, np.ndarray):
                 yield z, np.ascontiguousarray(part[:, self.entries]), C
             else:
-                yield z, SeenPart(part, self.entries, self._n), C
+                yield z, OwnFunction(part, self.entries, self._n), C
 
     def _parts(self, H: Any) -> Iterator[tuple[np.ndarray, Any]]:
         """Yield the rows of parts that each depend on one other block at most, with their H."""
@@ -133,7 +133,7 @@ class View:
         return entries
 
 
-class SeenPart:
+class OwnFunction:
     """Linearises readings of n states by ``function`` for a node that estimates ``entries``."""
 
     def __init__(self, function: Any, entries: np.ndarray, n: int) -> None:
@@ -203,8 +203,8 @@ class Node:
         start: tuple[FloatArray, FloatArray],
         info: NodeInfo,
         points: Spread,
-        view: View | None = None,
-        gate: Gate | None = None,
+        view: View | None,
+        gate: Gate | None,
     ) -> None:
         """Set up the filter with its ``model`` and its estimate ``start`` = (xhat (n,), P (n, n))
         at time 0, and an empty inbox; ``node`` is an id, ``entity`` an index, ``points`` are those
@@ -278,10 +278,10 @@ class Node:
             own = self.algorithm.emit(self.state, exchange)[1]
         messages = [Message(e.sender, e.weight, self._translated(e, own), e.age) for e in envelopes]
         if self._gate is not None:
-            messages = [m._replace(payload=self._gated(m, time, recorder)) for m in messages]
+            messages = [m._replace(payload=self._gate_payload(m, time, recorder)) for m in messages]
         return envelopes, messages
 
-    def _gated(self, message: Message, time: float, recorder: Recorder) -> Any:
+    def _gate_payload(self, message: Message, time: float, recorder: Recorder) -> Any:
         payload, reading = message.payload, getattr(message.payload, "reading", None)
         whole = isinstance(payload, Payload) and payload.sender.kernels.sends_whole_readings
         # Errors of estimates are correlated in an unknown way with those of the node.
@@ -386,12 +386,12 @@ class ClockedNode(Node):
         increments: list[Any],
         clock: NodeTime,
         response: Response | None,
-        *arguments: Any,
+        **arguments: Any,
     ) -> None:
         """``response`` is that to the input which estimates are counted from: at the time of the
         ``clock``, while all else is counted from it at the true time; None if they never differ.
         """
-        super().__init__(*arguments)
+        super().__init__(**arguments)
         self._timeline, self._recorder, self._truth = timeline, recorder, truth
         self._increments, self._clock, self._response = increments, clock, response
         # The time in seconds by its clock, to which the filter is predicted, and that up to which

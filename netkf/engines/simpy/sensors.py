@@ -32,12 +32,9 @@ def sensor_processes(
     """Return a process for each node with increment sensors and for each sampled sensor, which a
     node reads while it is ``up(node)``.
     """
-    index = scenario.topology.index
     processes = [
         # One process for all increment sensors of a node: they are read at the same times.
-        _increment_process(
-            scenario, timeline, recorder, truth, nodes[node], (node, index[node]), up
-        )
+        _increment_process(scenario, timeline, recorder, truth, nodes[node], node, up)
         for node in scenario.increment_sensors
     ]
     times, entity = scenario.sample_times(streams), 0
@@ -59,15 +56,14 @@ def _increment_process(
     recorder: Recorder,
     truth: Any,
     carrier: ClockedNode,
-    ids: tuple[int, int],
+    node: int,
     up: Callable[[int], bool],
 ) -> Process:
-    node, entity = ids
     # From grid point 1 on, since increments need an interval.
     k = 1
     # Half open: the horizon is excluded.
     while (time := truth.grid(k)) < scenario.horizon:
-        yield timeline.at(time, Rank.SENSE, entity)
+        yield timeline.at(time, Rank.SENSE, scenario.topology.index[node])
         if up(node):
             recorder.append((time, SENSE, node, -1, -1, -1, NAN))
         # predict_to() uses the increments up to now.

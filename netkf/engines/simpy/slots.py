@@ -1,7 +1,7 @@
 """Scenarios in slots: all nodes follow one schedule of predictions, readings and exchanges.
 
-Each node is a process that follows the schedule of the filter; each node with sensors has another
-process that reads them; one process, the slot clock, lets nodes, or pairs, transmit at once.
+Each node is a process that follows the schedule of the filter; one process, the slot clock, lets
+nodes, or pairs, transmit at once. Those that read sensors and take samples are in ``engine``.
 """
 
 from __future__ import annotations
@@ -20,12 +20,10 @@ from netkf.engines.simpy.transmission import LinkExchange, Transmitter
 from netkf.linalg.arrays import FloatArray, block_diagonal
 from netkf.network.channels import senders_of_pairs
 from netkf.network.matchings import used_links
-from netkf.plants.linear import Readings
-from netkf.plants.readings import readings_of
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
-from netkf.trace.schema import ABSORB, ROUND, SENSE, STOP, SWAP, TICK
+from netkf.trace.schema import ABSORB, ROUND, STOP, SWAP, TICK
 
 FIRST_RANK = Rank.PROBE + 1
 """The stages of a slot come after arrivals of the same instant; their ranks follow the schedule."""
@@ -131,9 +129,9 @@ class SlotNode(Node):
         schedule: SlotSchedule,
         period: float,
         streams: Streams,
-        *arguments: Any,
+        **arguments: Any,
     ) -> None:
-        super().__init__(*arguments)
+        super().__init__(**arguments)
         # Only randomised filters draw from this stream.
         randomised = self._timing.randomised
         self._uniforms = streams.generator("trigger", self.node) if randomised else None
@@ -259,44 +257,6 @@ class SlotNode(Node):
 def _finite_rows(y: FloatArray, H: FloatArray) -> np.ndarray:
     # A sensor without a reading may give an empty y.
     return np.isfinite(y) if len(y) == len(H) else np.zeros(len(H), dtype=bool)
-
-
-class Reader:
-    """The sensors of one node: a process that reads the truth once a slot."""
-
-    def __init__(
-        self,
-        recorder: Recorder,
-        schedule: SlotSchedule,
-        node: int,
-        entity: int,
-        carrier: SlotNode,
-        up: Callable[[int], bool],
-    ) -> None:
-        """``up(node)`` says whether a node is up now: then it reads."""
-        self._up = up
-        self._recorder, self._schedule = recorder, schedule
-        self._node, self._entity, self._carrier = node, entity, carrier
-
-    def run_process(
-        self, timeline: Timeline, truth: Any, sensors: list[tuple[Readings, FloatArray]]
-    ) -> Process:
-        """Read all ``sensors``, each with the R (p, p) that the filter believes, in every slot."""
-        slot = 0
-        while self._schedule.runs(slot):
-            for stage in self._schedule.stages(slot):
-                if stage.kind == "read":
-                    yield timeline.at(stage.time, stage.rank, self._entity)
-                    up = self._up(self._node)
-                    if up:
-                        self._recorder.append((stage.time, SENSE, self._node, -1, -1, -1, NAN))
-                    # In the coordinates of the estimates, as H x is.
-                    x = truth.local(slot)
-                    for sensor, R in sensors:
-                        for reading in readings_of(sensor, slot, x, R):
-                            if up:
-                                self._carrier.read(self._node, *reading)
-            slot += 1
 
 
 class SlotClock:
