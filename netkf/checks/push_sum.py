@@ -281,13 +281,13 @@ def _assumptions(scenario: Scenario) -> list[Assumption]:
         light, evidence = False, str(error)
     algorithm: Any = with_promised_filter(scenario).filter.algorithm
     holds = algorithm.stop == "never" and not algorithm.asymptotic
-    told = "exchanged for ever" if holds else "gains are frozen or taken from the limit"
+    exchange = "exchanged for ever" if holds else "gains are frozen or taken from the limit"
     if not np.array_equal(scenario.slot_belief[0], scenario.linear_plant.F):
-        holds, told = False, "exchanged, but the filters' F is not the plant's"
+        holds, exchange = False, "exchanged, but the filters' F is not the plant's"
     if any(sensor.varying for sensor in scenario.sensors):
-        holds, told = False, "exchanged, but H differs from slot to slot"
+        holds, exchange = False, "exchanged, but H differs from slot to slot"
     return [
-        Assumption("mass is exchanged in every slot", "P step 2", holds, told),
+        Assumption("mass is exchanged in every slot", "P step 2", holds, exchange),
         Assumption("mean squares have a variance", "derived", light, evidence),
         *usual_assumptions(scenario),
     ]

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Sequence
-from typing import NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 from netkf.core.csv_files import Columns
 from netkf.core.errors import ScenarioError
 
 Key = TypeVar("Key", bound=Hashable)
+Subject = TypeVar("Subject", bound=Hashable)
+Value = TypeVar("Value")
 
 
 class RowUse(NamedTuple):
@@ -26,6 +28,14 @@ class RowUse(NamedTuple):
     def unused(self) -> int:
         """Number of rows that are neither used nor merged."""
         return self.rows - self.used - self.merged
+
+
+class KeyedTable(NamedTuple, Generic[Subject, Value, Key]):
+    """A table that was read: what it says of each subject, its columns, the key of each row."""
+
+    of: dict[Subject, Value]
+    columns: Columns
+    keys: list[Key]
 
 
 def count_rows(path: str, keys: Iterable[Key], is_used: Callable[[Key], bool]) -> RowUse:

@@ -137,9 +137,9 @@ def draws_per_link(channel: Channel) -> bool:
 
 
 def has_identical_links(channel: Channel) -> bool:
-    """Return True if fates and delays depend on no number, time or state."""
-    same_fate = identical_per_link(channel.loss) and channel.channels is None
-    return same_fate and not delay_depends_on_message(channel.delay)
+    """Return True if losses and delays depend on no number, time or state."""
+    one_law = identical_per_link(channel.loss) and channel.channels is None
+    return one_law and not delay_depends_on_message(channel.delay)
 
 
 class ChannelDraw(NamedTuple):

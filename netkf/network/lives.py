@@ -27,7 +27,7 @@ from netkf.core.fields import (
     positive,
     source_file,
 )
-from netkf.core.repeated_rows import RowUse, count_rows, first_rows
+from netkf.core.repeated_rows import KeyedTable, RowUse, count_rows, first_rows
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Topology, demand_in_graph
 
@@ -145,7 +145,7 @@ class RecordedLife(Life):
     _reads = "_table"
 
     @cached_property
-    def _table(self) -> tuple[dict[int, list[Change]], list[tuple[int, float]]]:
+    def _table(self) -> KeyedTable[int, list[Change], tuple[int, float]]:
         """The changes of each node in the order of time; the node and time of each row."""
         kinds = {"up": "restart", "down": "crash", "join": "join", "leave": "leave"}
         table = read_columns(self.path, ("t", "node", "what"), words={"what": tuple(kinds)})
@@ -161,18 +161,18 @@ class RecordedLife(Life):
                 state = "up" if changes[-1].up else "down"
                 rule = f"{table.where(before, row)}: node {node} is {state} already"
                 raise ScenarioError("path", rule, time, "correct the rows of the node")
-        return found, keys
+        return KeyedTable(found, table, keys)
 
     @property
     def rows(self) -> FloatArray:
         """The times (K,) of all rows in seconds, in the order of the table."""
-        return np.array([t for _, t in self._table[1]])
+        return np.array([t for _, t in self._table.keys])
 
     def use(self, end: float) -> RowUse:
         """Return the use of the rows by a run to ``end`` (s): those after 0, and the one that says
         how a node begins: the last one until then, or the first one if the node goes up by it.
         """
-        found, keys = self._table
+        found, keys = self._table.of, self._table.keys
         first = {
             node: max((change.time for change in changes if change.time <= 0.0), default=0.0)
             for node, changes in found.items()
@@ -186,7 +186,7 @@ class RecordedLife(Life):
         self, node: int, random: Callable[[], np.random.Generator], horizon: float
     ) -> Sequence[Change]:
         """Return the rows of the node; those at time 0 or before say how it begins."""
-        listed = self._table[0].get(node, [])
+        listed = self._table.of.get(node, [])
         after = [change for change in listed if change.time > 0.0]
         if listed and not after and not listed[-1].up:
             return [Change(math.inf, "restart")]
@@ -195,7 +195,7 @@ class RecordedLife(Life):
     def check(self, topology: Topology) -> None:
         """Raise ScenarioError unless all nodes of the table are in the entry."""
         super().check(topology)
-        missing = sorted(set(self._table[0]) - set(self.nodes))
+        missing = sorted(set(self._table.of) - set(self.nodes))
         if missing:
             rule = f"{self.path.name} has rows of nodes that are not in nodes"
             raise ScenarioError("path", rule, missing, "add them to nodes, or remove the rows")

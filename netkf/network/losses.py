@@ -16,7 +16,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from netkf.core.contracts import kernel_problem
-from netkf.core.csv_files import Columns, read_columns
+from netkf.core.csv_files import read_columns
 from netkf.core.errors import ScenarioError, quote
 from netkf.core.fields import (
     Component,
@@ -33,7 +33,7 @@ from netkf.core.fields import (
     stated,
 )
 from netkf.core.laws import Chain
-from netkf.core.repeated_rows import RowUse, count_rows, first_rows
+from netkf.core.repeated_rows import KeyedTable, RowUse, count_rows, first_rows
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.functions import call_function
@@ -388,10 +388,10 @@ class GilbertElliott(Loss):
         return "sender" if self.shared else "link"
 
     @cached_property
-    def _table(self) -> tuple[dict[Link, GilbertElliott], Columns | None, list[Link]]:
-        """The chain of each directed link with a row, the table, and the link of each row."""
+    def _table(self) -> KeyedTable[Link, GilbertElliott, Link] | None:
+        """The chain of each directed link with a row, and the link of each row."""
         if self.path is None:
-            return {}, None, []
+            return None
         table = read_columns(self.path, ("sender", "receiver"), _CHAIN)
         links = list(zip(table.integers("sender"), table.integers("receiver"), strict=True))
         columns = [name for name in _CHAIN if name in table]
@@ -414,24 +414,25 @@ class GilbertElliott(Loss):
                 lines = [table.lines[first_row[link]] for link in (first, second)]
                 got = f"{list(first)} in line {lines[0]} and {list(second)} in line {lines[1]}"
                 raise ScenarioError("path", rule, got, "correct the rows")
-        return chains, table, links
+        return KeyedTable(chains, table, links)
 
     def use(self, end: float) -> RowUse:
         """Return the use of the rows of the table by a run to ``end`` (s)."""
-        assert self.path is not None
-        return count_rows(self.path.name, self._table[2], lambda _: end > 0.0)
+        table = self._table
+        assert table is not None
+        return count_rows(table.columns.source.name, table.keys, lambda _: end > 0.0)
 
     def of(self, link: Link) -> GilbertElliott:
         """Return the chain of a directed link."""
-        return self._table[0].get(link, self)
+        return self if self._table is None else self._table.of.get(link, self)
 
     def check(self, topology: Topology) -> None:
         """Raise ScenarioError unless every row of the table is of a link, and every link has a
         chain.
         """
-        chains, table, _ = self._table
-        if table is None:
+        if self._table is None:
             return
+        chains, table, _ = self._table
         demand_links(table, topology, "sender", "receiver")
         if all(getattr(self, name) is None for name in _CHAIN):
             for link in topology.directions:

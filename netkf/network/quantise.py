@@ -65,8 +65,8 @@ def quantise_number(
     dither = step * (unit - 0.5)
     level = np.floor((value + dither + limit) / step)
     kept = min(max(level, 0.0), levels - 1.0)
-    # What has heard of no mass must not divide by an error: nothing is told as nothing. A zero may
-    # be one but for rounding, which is not the same in both engines.
+    # A mass of 0 is received as 0, since receivers divide by masses; so is one that is 0 but for
+    # rounding, which is not the same in both engines.
     received = 0.0 if abs(value) <= NOTHING * step else (kept + 0.5) * step - limit - dither
     return received, kept != level
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -23,7 +22,7 @@ from netkf.core.fields import (
     source_file,
 )
 from netkf.core.instants import OnGrid
-from netkf.core.repeated_rows import RowUse, count_rows, first_rows
+from netkf.core.repeated_rows import KeyedTable, RowUse, count_rows, first_rows
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Link, Topology, demand_links
 from netkf.network.losses import Loss, Transmission
@@ -56,13 +55,13 @@ class ScheduledLoss(Loss, OnGrid):
     path: SourceFile = field(source_file)
     otherwise: float = field(probability, default=1.0)
 
-    _reads = "_steps"
+    _reads = "_table"
 
     @cached_property
-    def _steps(
+    def _table(
         self,
-    ) -> tuple[dict[Link, tuple[FloatArray, FloatArray]], Columns, list[tuple[Link, float, float]]]:
-        """Times and probabilities (K,) by link, the table, and link and times of each row."""
+    ) -> KeyedTable[Link, tuple[FloatArray, FloatArray], tuple[Link, float, float]]:
+        """Times and probabilities (K,) of each link, and the link and times of each row."""
         table = _read_deliveries(self.path, ("from", "until", "sender", "receiver"))
         begins, ends, values = (table[name].tolist() for name in ("from", "until", "delivery"))
         links = list(zip(table.integers("sender"), table.integers("receiver"), strict=True))
@@ -86,40 +85,41 @@ class ScheduledLoss(Loss, OnGrid):
                 times += [begins[row], ends[row]]
                 probabilities += [values[row], self.otherwise]
             steps[link] = np.array(times), np.array(probabilities)
-        return steps, table, keys
+        return KeyedTable(steps, table, keys)
 
     @cached_property
     def _instants(self) -> dict[Link, FloatArray]:
         """The times (K,) by link on the grid of the scenario, as messages are sent."""
-        return {link: self.time_grid.snap(times) for link, (times, _) in self._steps[0].items()}
+        return {link: self.time_grid.snap(times) for link, (times, _) in self._table.of.items()}
 
     def use(self, end: float) -> RowUse:
         """Return the use of the rows by a run to ``end`` (s): of those that hold in it."""
-        return count_rows(self.path.name, self._steps[2], lambda key: key[1] < end and key[2] > 0.0)
+        keys = self._table.keys
+        return count_rows(self.path.name, keys, lambda key: key[1] < end and key[2] > 0.0)
 
     def delivery_probability(self, sent: Transmission) -> Any:
         """Return the probability of the direction at the time of sending."""
-        if sent.link not in self._steps[0]:
+        if sent.link not in self._table.of:
             return self.otherwise
-        times, probabilities = self._instants[sent.link], self._steps[0][sent.link][1]
+        times, probabilities = self._instants[sent.link], self._table.of[sent.link][1]
         # Of a row that begins where another ends the last entry counts.
         return probabilities[np.searchsorted(times, sent.time, side="right") - 1]
 
     @property
     def independent(self) -> bool:
         """True only if no direction changes: then neighbouring messages are not lost alike."""
-        return all(np.ptp(values) == 0.0 for _, values in self._steps[0].values())
+        return all(np.ptp(values) == 0.0 for _, values in self._table.of.values())
 
     def mean_delivery(self, sent: Transmission) -> float:
         """Return the probability of a direction if it does not change, else nan."""
-        if sent.link not in self._steps[0]:
+        if sent.link not in self._table.of:
             return self.otherwise
-        _, probabilities = self._steps[0][sent.link]
+        _, probabilities = self._table.of[sent.link]
         return float(probabilities[0]) if np.ptp(probabilities) == 0.0 else math.nan
 
     def check(self, topology: Topology) -> None:
         """Raise ScenarioError unless every pair of the table is a link."""
-        demand_links(self._steps[1], topology, "sender", "receiver")
+        demand_links(self._table.columns, topology, "sender", "receiver")
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,17 +140,15 @@ class Hopping(Component):
         for a channel that the table does not list.
         """
         super().__post_init__()
-        listed = {channel for channel, _ in self._table[0]}
+        listed = {channel for channel, _ in self._table.of}
         for channel in self.hopping:
             if channel not in listed:
                 rule, remedy = f"needs rows of each channel in {self.path.name}", "add its rows"
                 raise ScenarioError("hopping", rule, channel, remedy)
 
     @cached_property
-    def _table(
-        self,
-    ) -> tuple[Mapping[tuple[int, Link | None], float], Columns, list[tuple[int, Link | None]]]:
-        """Deliveries by channel and link (None: all), the table, channel and link of each row."""
+    def _table(self) -> KeyedTable[tuple[int, Link | None], float, tuple[int, Link | None]]:
+        """The delivery of each channel and link (None: all)."""
         table = _read_deliveries(self.path, ("channel",), ("sender", "receiver"))
         channels: list[int] = table.integers("channel")
         links: list[Link | None] = [None] * len(channels)
@@ -162,12 +160,12 @@ class Hopping(Component):
             links = list(zip(table.integers("sender"), table.integers("receiver"), strict=True))
         keys, values = list(zip(channels, links, strict=True)), table["delivery"].tolist()
         rows = first_rows(table, keys, values, "a channel must have one delivery")
-        return {key: values[row] for key, row in rows.items()}, table, keys
+        return KeyedTable({key: values[row] for key, row in rows.items()}, table, keys)
 
     def use(self, end: float) -> RowUse:
         """Return the use of the rows by a run to ``end`` (s): of channels in use."""
         used = self.hopping if end > 0.0 else ()
-        return count_rows(self.path.name, self._table[2], lambda key: key[0] in used)
+        return count_rows(self.path.name, self._table.keys, lambda key: key[0] in used)
 
     def delivery(self, sent: Transmission) -> Any:
         """Return the probability that the message ``sent`` arrives on its channel."""
@@ -179,7 +177,7 @@ class Hopping(Component):
 
     def on_hops(self, link: Link) -> FloatArray:
         """Return the probabilities (H,) that a message on each of the hops arrives."""
-        deliveries = self._table[0]
+        deliveries = self._table.of
         key = None if (self.hopping[0], None) in deliveries else link
         return np.array([deliveries[channel, key] for channel in self.hopping])
 

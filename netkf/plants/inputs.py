@@ -206,16 +206,9 @@ class RecordedInput(Input):
         return columns
 
     @cached_property
-    def _table(self) -> tuple[Columns, FloatArray]:
-        """The columns of the rows that count, and u (K, m) of these."""
-        columns = self._columns.of_node(self.node)
-        names = [name for name in columns if number_of(name, "u") >= 0]
-        return columns, np.stack([columns[name] for name in names], axis=1)
-
-    @property
     def columns(self) -> Columns:
         """The columns of the rows that count."""
-        return self._table[0]
+        return self._columns.of_node(self.node)
 
     @property
     def row_keys(self) -> list[float]:
@@ -227,7 +220,8 @@ class RecordedInput(Input):
         """The system whose output is u, which jumps at the rows; raises ScenarioError for two
         values at one time.
         """
-        u = self._table[1]
+        names = [name for name in self.columns if number_of(name, "u") >= 0]
+        u = np.stack([self.columns[name] for name in names], axis=1)
         rule = "there may be one row a time, or equal ones"
         first = first_rows(self.columns, self.row_keys, u.tolist(), rule)
         times = np.array(sorted(first))[self._begun :]

@@ -142,21 +142,21 @@ def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
 
 @dataclass(frozen=True, eq=False)
 class _Output:
-    """A run directory with its sinks; ``links`` and ``network`` are empty where not wanted."""
+    """A run directory with its sinks; those that are not wanted are None."""
 
     directory: Path
     scenario: Scenario
     samples: SummarySink
     tables: ParquetSink | None
-    links: list[SentPerLink]
-    network: list[NetworkSink]
+    links: SentPerLink | None
+    network: NetworkSink | None
     manifest: Manifest
     fingerprint: Fingerprint
 
     @property
     def sinks(self) -> list[Sink]:
-        tables = [] if self.tables is None else [self.tables]
-        return [self.samples, self.fingerprint, *tables, *self.links, *self.network]
+        wanted = (sink for sink in (self.tables, self.links, self.network) if sink is not None)
+        return [self.samples, self.fingerprint, *wanted]
 
     def close_tables(self) -> None:
         """Finish the Parquet tables, if the run has any; raises WriteError."""
@@ -175,10 +175,10 @@ class _Output:
             "delivered": count("deliver"),
             "lost": count("lost") + count("late"),
         }
-        network = self.network[0].values(status == "complete") if self.network else None
+        network = self.network.values(status == "complete") if self.network else None
         summary = summarise(self.scenario, self.samples, promised, messages, network)
-        if self.network and self.network[0].connectivity.changes:
-            summary["connectivity"] = self.network[0].connectivity.entry()
+        if self.network and self.network.connectivity.changes:
+            summary["connectivity"] = self.network.connectivity.entry()
         if sums:
             summary["conserved"] = {
                 name: {"exact": exact, "total": total, "drift": (total - exact) / exact}
@@ -187,7 +187,7 @@ class _Output:
         # How much of the recorded tables (readings, losses) the run has used; a run that ended
         # early did not use all that a complete one would have.
         if status == "complete":
-            usage = record_usage(self.scenario, self.links[0].sent.counts() if self.links else {})
+            usage = record_usage(self.scenario, self.links.sent.counts() if self.links else {})
             summary |= {"records": usage} if usage else {}
             if self.scenario.held_out_sensors:
                 from netkf.runs.readings import errors_of_replica
@@ -224,8 +224,8 @@ def _create_output(
         scenario=scenario,
         samples=samples,
         tables=ParquetSink(directory, scenario, replica) if tables else None,
-        links=[SentPerLink()] if is_recorded else [],
-        network=[NetworkSink(scenario, seed, replica, samples.transmissions)] if wanted else [],
+        links=SentPerLink() if is_recorded else None,
+        network=NetworkSink(scenario, seed, replica, samples.transmissions) if wanted else None,
         manifest=manifest,
         fingerprint=Fingerprint(),
     )

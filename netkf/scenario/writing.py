@@ -117,9 +117,10 @@ def part_as_table(part: Component) -> dict[str, Any]:
 def _part_table(part: Component, style: _Style) -> dict[str, Any]:
     values = _field_values(part, style)
     if isinstance(part, Filtering):
-        is_told = {"mean": True, "cov": True, "model": part.model != Belief()}
-        is_told |= {"linearise": True, "estimates": True, "gate": True}
-        rest = {key: values[key] for key, told in is_told.items() if told and values.get(key)}
+        keys = ["mean", "cov", "model", "linearise", "estimates", "gate"]
+        if part.model == Belief():
+            keys.remove("model")
+        rest = {key: values[key] for key in keys if values.get(key)}
         return {**_part_table(part.algorithm, style), **rest}
     family = next((family for family, base in FAMILIES.items() if isinstance(part, base)), None)
     if family is None:

@@ -86,7 +86,7 @@ def is_near(
         distance += distance_row * distance_row
     near = select(distance < alpha, 1.0, 0.0)
     # With M = S^-1 Sbar, P^-1 Pbar has the eigenvalues of M M'. Both bounds on P mean that a matrix
-    # is positive definite: (1 + delta) M M' - I, then (1 + delta) I - M M'.
+    # is positive definite: bound M M' - I, then bound I - M M'.
     for sign in (-1.0, 1.0):
         for i in range(n):
             for j in range(i + 1):

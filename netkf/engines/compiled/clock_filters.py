@@ -37,11 +37,11 @@ class ClockFilters:
         self.kernels = kernels
         self._p = self._samples = 1
         columns = PairColumns(scenario, entries_of(scenario))
-        self._columns, self._n = (columns.width, columns.entries.shape[1]), scenario.plant.n
+        self._columns, self._width, self._n = columns.width, start.xhat.shape[1], scenario.plant.n
         self._gate = scenario.filter.gate
         pooled = scenario.node_filter.timing.pooled
         infos = scenario.node_infos[:1] if pooled else scenario.node_infos
-        self._own = own_sizes(infos, self._columns[1], pooled)
+        self._own = own_sizes(infos, self._width, pooled)
         self._readings = None
         self._known_pairs: tuple[Any, ...] = ()
         if not (linear := all(sensor.linear for sensor in scenario.sensors)):
@@ -162,14 +162,13 @@ class ClockFilters:
 
     def _inbox(self, messages: int) -> dict[str, Any]:
         readings = 1 + messages if self.kernels.sends_readings else 1
-        columns, own = self._columns
-        pairs = no_pairs()
-        if columns > own:
+        columns, pairs = self._columns, no_pairs()
+        if columns > self._width:
             count = readings * self._samples
             rows = linear_rows(count, self._p, np.full((count, columns), -1))
             rows.R[0], rows.origin = np.eye(self._p), np.zeros((1, self._n))
             first = np.zeros(1 + readings, dtype=np.int64)
-            pairs = empty_pairs(rows, own, first, *self._known_pairs)
+            pairs = empty_pairs(rows, self._width, first, *self._known_pairs)
         return {
             "pairs": pairs,
             "gate": self._gate_of_instants(),
@@ -185,7 +184,7 @@ class ClockFilters:
         if self._gate is None:
             return no_gate()
         parts = [(0, self._p)] * self._samples
-        return gate_tables(self._gate, self._columns[1], (1, 1), [parts], self._own)
+        return gate_tables(self._gate, self._width, (1, 1), [parts], self._own)
 
     def advance(self, state: Simulation) -> int:
         """Run the event loop until it needs something from Python; return its request."""
@@ -219,8 +218,8 @@ class ClockFilters:
         """Return for how many messages there must be room with those that are translated, or that
         a node tells all others at once.
         """
-        told = self._degree + 1 if self.kernels.addressed else 0
-        return (2 * messages if len(self._common) else messages) + told
+        addressed = self._degree + 1 if self.kernels.addressed else 0
+        return (2 * messages if len(self._common) else messages) + addressed
 
     def grow(self, messages: int) -> None:
         """Make room for so many messages; those that are there stay."""

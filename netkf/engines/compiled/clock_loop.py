@@ -371,19 +371,19 @@ def send_all(
     arrives = becomes == SOME_ARRIVE or verbs.counts_sends == 1 or verbs.decides == 1
     run.sends[0] = 1
     choose_model(state, run, verbs, h)
-    few_bits, told, count = len(state.quantiser.fields) > 0, m, 1
+    few_bits, payload, count = len(state.quantiser.fields) > 0, m, 1
     if few_bits and verbs.addressed == 1:
         # All its messages at once, behind those under way, as each takes dither.
-        told, count = len(run.message), run.first[h + 1] - run.first[h] + 1
+        payload, count = len(run.message), run.first[h + 1] - run.first[h] + 1
         run.receiver = ALL
     if arrives and (few_bits or verbs.addressed == 0):
-        clear_payloads(state.quantiser, told, count)
-        call_at_two(verbs.emit, record, h, told, run)
+        clear_payloads(state.quantiser, payload, count)
+        call_at_two(verbs.emit, record, h, payload, run)
     if run.sends[0] == 0:
         release(state, m)
         return
     if becomes != NONE_SENT:
-        state.clipped = quantise_payloads(state.quantiser, h, told, count, 0)
+        state.clipped = quantise_payloads(state.quantiser, h, payload, count, 0)
     if broadcast:
         record_event(state, now, TRANSMIT, state.nodes[h].id, -1, state.nodes[h].sent)
         state.nodes[h].sent += 1
@@ -399,7 +399,7 @@ def send_all(
                     call_at_two(verbs.copy, record, copy, m, run)
             used = True
             if verbs.addressed == 1:
-                address_message(state, record, run, verbs, (h, w), copy, told)
+                address_message(state, record, run, verbs, (h, w), copy, payload)
             dispatch(state, w, copy, tag, delay, now)
     if not used:
         release(state, m)
@@ -408,10 +408,10 @@ def send_all(
 @kernel
 def address_message(
     state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, of: tuple[int, int],
-    m: int, told: int,
+    m: int, payload: int,
 ) -> None:  # fmt: skip
     """Let node ``h`` write payload ``m`` for the receiver of directed link ``w``, ``of`` both, or
-    copy it from those that it has ``told``, if that is not the same place.
+    copy it from those emitted from ``payload`` on, if that is not the same place.
     """
     h, w = of
     run.receiver = run.opposite[state.incoming[w]]
@@ -420,7 +420,7 @@ def address_message(
         return
     first, last = run.first[h], run.first[h + 1]
     link = run.receiver if run.receiver >= 0 else last
-    call_at_two(verbs.copy, record, m, told + link - first, run)
+    call_at_two(verbs.copy, record, m, payload + link - first, run)
 
 
 @kernel

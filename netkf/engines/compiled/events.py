@@ -291,8 +291,8 @@ def stamped_age(state: Simulation, m: int, now: float) -> float:
     direction, sent = state.directions[state.pool[m].direction], state.pool[m].sent
     j, per_second = direction.receiver, state.per_second
     shown = local_time(state, j, now)
-    told = snapped(shown - local_time(state, direction.sender, sent), per_second)
-    return min(max(told, 0.0), snapped(shown - local_time(state, j, 0.0), per_second))
+    age = snapped(shown - local_time(state, direction.sender, sent), per_second)
+    return min(max(age, 0.0), snapped(shown - local_time(state, j, 0.0), per_second))
 
 
 @kernel

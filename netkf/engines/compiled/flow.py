@@ -146,15 +146,16 @@ class Workspace:
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario, self._senders = scenario, senders_of(scenario)
-        self.filters, (entities, directions) = filters_at_start(scenario), entity_records(scenario)
+        self.filters = filters_at_start(scenario)
+        self._entities, directions = entity_records(scenario)
         # A copy, since directed links count the messages of a run.
-        self._records = entities, directions.copy()
+        self._directions = directions.copy()
         # By receiver and sender: the order in which filters add up messages.
         order = np.lexsort((directions["sender"], directions["receiver"]))
         self._incoming = np.argsort(order, kind="stable")
         self._waiting = np.zeros(len(self.filters.nodes), dtype=np.int64)
         size, n = self.filters.xhat.shape
-        self._pool = empty_pool(FIRST_MESSAGES)
+        self._pool, self._heap = empty_pool(FIRST_MESSAGES)
         self._probes = np.array(scenario.times, dtype=np.float64)
         # Space for many samples, within a budget of floats.
         samples = max(1, min(MAX_BUFFERED_SAMPLES, MAX_BUFFERED_FLOATS // (size * n * n)))
@@ -175,7 +176,7 @@ class Workspace:
         """Return an empty queue of visits, with space for all nodes of ``together`` runs."""
         capacity = together * len(self.filters.nodes)
         if self._visits is None or len(self._visits.level) < capacity:
-            series, weights = series_of_lanes(self._scenario), self._records[1]["weight"]
+            series, weights = series_of_lanes(self._scenario), self._directions["weight"]
             exchange = pair_exchange(self._scenario, self._kernels, weights)
             self._visits = empty_visits(self.filters, weights, capacity, series, exchange)
         return self._visits
@@ -198,12 +199,10 @@ class Workspace:
         """
         start, instants, window = self.filters, draws.instants, draws.window()
         changes = np.array(self._scenario.followed_changes)
-        entities, directions = self._records
         # Records of links belong to the workspace: the numbers of their messages start again.
-        directions["messages"] = 0
-        pool = self._pool[0]
+        self._directions["messages"] = 0
         # All messages are free: a linked list in the order of the pool.
-        pool["next"] = np.arange(1, len(pool) + 1)
+        self._pool["next"] = np.arange(1, len(self._pool) + 1)
         if self._scratch is None:
             self._scratch = scratch_arrays(
                 start.table, start.gains, self._unrolled, self._scenario.plant.n
@@ -220,12 +219,12 @@ class Workspace:
             now=self._scenario.time_grid.snap(np.resize(nodes["offset"], len(xhat))),
             table=start.table,
             gains=start.gains,
-            entities=entities,
+            entities=self._entities,
             outgoing=self._senders.outgoing,
-            directions=directions,
+            directions=self._directions,
             incoming=self._incoming,
-            pool=pool,
-            heap=self._pool[1],
+            pool=self._pool,
+            heap=self._heap,
             waiting=self._waiting,
             instants=instants,
             sensing=draws.sensing,
@@ -274,7 +273,7 @@ class Workspace:
             "clock_kind": CLOCKS.index(self._senders.at),
             "newest_only": algorithm.timing.newest_only,
             "most_messages": max_messages,
-            "free_count": len(self._pool[0]),
+            "free_count": len(self._pool),
             # Each message of a tick leaves a "send", its outcome and perhaps an "absorb", and the
             # tick or transmission two rows more, and payloads of few bits of both ends two; an
             # instant of samples leaves one row per sensing node, and a gate one per sample.

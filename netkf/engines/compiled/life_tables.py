@@ -56,9 +56,9 @@ class LifeTable(NamedTuple):
         return down
 
 
-NOBODY: IntArray = np.zeros(0, dtype=np.int64)
+_NOTHING: IntArray = np.zeros(0, dtype=np.int64)
 NO_LIVES = LifeTable(
-    np.zeros(0), NOBODY, NOBODY, np.zeros(0, dtype=bool), np.zeros(1, dtype=np.int64)
+    np.zeros(0), _NOTHING, _NOTHING, np.zeros(0, dtype=bool), np.zeros(1, dtype=np.int64)
 )
 
 
@@ -109,5 +109,4 @@ def links_of_lives(
     for e, times in enumerate(listed):
         for w in senders.outgoing[senders.first[e] : senders.first[e + 1]].tolist():
             heard[w] = ~lives.is_down(index[senders.directions[w][0]], times)
-    nothing = np.zeros(0, dtype=np.int64)
-    return MovingLinks(heard, [], nothing, nothing.reshape(0, 3))
+    return MovingLinks(heard, [], _NOTHING, _NOTHING.reshape(0, 3))

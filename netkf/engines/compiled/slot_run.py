@@ -237,7 +237,7 @@ class SlotRuns:
         # link: in as many slots as have arrival bits in the processor's cache.
         self._units: FloatArray | None = None
         keeps = len(channels.state) or self._calls_law or not setup.fresh[:1].any()
-        if len(channels.loss) and setup.matching[0] < 0 and not keeps:
+        if len(channels.loss) and setup.matching.protocol < 0 and not keeps:
             steps, bits = len(setup.fresh), len(setup.fresh) * len(setup.directions) * LANES
             self._units = np.empty(steps * max(1, CACHED // bits))
         if setup.algorithm.timing.randomised:
@@ -404,7 +404,7 @@ class SlotRuns:
         shape, pairs = (len(times.start), len(setup.fresh)), setup.max_pairs
         decided = setup.decides or setup.may_miss
         # Without matchings the arrays of pairs stay empty.
-        matched = self.runs if setup.matching[0] >= 0 else 0
+        matched = self.runs if setup.matching.protocol >= 0 else 0
         messages = SlotMessages(
             up=np.zeros((self._blocks, *shape, len(setup.directions), LANES), dtype=np.uint8),
             active=np.empty((matched, *shape, pairs), dtype=np.int64),

@@ -92,7 +92,7 @@ class SlotSetup:
         self.opposite = opposite_links(self.links.first, self.links.sender)
         self.common = common_table(scenario)
         self._set_channel(scenario)
-        self.matching = matching_lists(scenario)
+        self.matching = matching_of(scenario)
         self.is_drawn = self._draws_everything(scenario)
 
     def _set_slots(self, scenario: Scenario) -> None:
@@ -436,19 +436,18 @@ class SlotSetup:
 
     def matchings(self, states: np.ndarray) -> Matchings:
         """Return the matching protocol with the streams ``states`` (R, WIDTH) of R runs."""
-        protocol, probability, first, members = self.matching
-        scratch = (np.zeros(size, dtype=np.int64) for size in (len(self.ends), len(self.nodes)))
-        return Matchings(protocol, probability, states, first, members, *scratch)
+        order, busy = (np.zeros(len(part), dtype=np.int64) for part in (self.ends, self.nodes))
+        return self.matching._replace(states=states, order=order, busy=busy)
 
     @property
     def max_pairs(self) -> int:
         """The largest number of pairs in a matching, 0 without matchings."""
-        return min(len(self.nodes) // 2, len(self.ends)) if self.matching[0] >= 0 else 0
+        return min(len(self.nodes) // 2, len(self.ends)) if self.matching.protocol >= 0 else 0
 
     def rows_of(self, slots: int) -> int:
         """Return an upper bound of the number of events in ``slots`` slots."""
-        pairs = self.max_pairs
-        sends = self.directions_per_link * (pairs if self.matching[0] >= 0 else len(self.ends))
+        pairs, has_pairs = self.max_pairs, self.matching.protocol >= 0
+        sends = self.directions_per_link * (pairs if has_pairs else len(self.ends))
         # A send and its outcome for each direction, a tick for each pair, a round, and one
         # absorption per node.
         steps = len(self.fresh) * (1 + pairs + 2 * sends + len(self.nodes))
@@ -526,11 +525,12 @@ QUICK_FLOPS = 1 << 25
 """Floating-point operations that take some ten milliseconds."""
 
 
-def matching_lists(scenario: Scenario) -> tuple[int, float, np.ndarray, np.ndarray]:
-    """Return the fields protocol, probability, first and members of Matchings."""
+def matching_of(scenario: Scenario) -> Matchings:
+    """Return the matching protocol of a scenario, without the streams and the scratch of runs."""
     activation, topology = scenario.network.activation, scenario.topology
+    none: np.ndarray = np.zeros(0, dtype=np.int64)
     if not isinstance(activation, Matching):
-        return -1, 0.0, np.zeros(1, dtype=np.int64), np.zeros(0, dtype=np.int64)
+        return Matchings(-1, 0.0, none, np.zeros(1, dtype=np.int64), none, none, none)
     protocol, links = PROTOCOLS.index(activation.protocol), topology.links
     lists: list[list[int]] = []
     if protocol == NODE_WAKEUP:
@@ -545,4 +545,4 @@ def matching_lists(scenario: Scenario) -> tuple[int, float, np.ndarray, np.ndarr
     probability = {ONE_EDGE: activation.lazy, INDEPENDENT: activation.p}.get(protocol) or 0.0
     first = np.cumsum([0, *map(len, lists)], dtype=np.int64)
     flat = np.array([k for members in lists for k in members], dtype=np.int64)
-    return protocol, probability, first, flat
+    return Matchings(protocol, probability, none, first, flat, none, none)

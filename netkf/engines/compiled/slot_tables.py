@@ -1,5 +1,5 @@
 """Messages in slots as tables, of many slots at a time, for channels and activations that kernels
-cannot draw: a user's own losses and delays, fates that hearers share, messages that take time,
+cannot draw: a user's own losses and delays, outcomes that hearers share, messages that take time,
 recorded exchanges, nodes that move or are down.
 
 Messages do not depend on estimates, unless nodes may be silent: then tables are one slot long, and

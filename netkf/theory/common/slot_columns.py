@@ -58,7 +58,7 @@ class SlotColumns(ErrorColumns):
         self._kernels = replace(kernels, decides=False)
         super().__init__()
         self._fewest = 0
-        self._all_observations = slot_observations(scenario, run, is_up=self._is_up)
+        self._observations = slot_observations(scenario, run, is_up=self._is_up)
         self._lives = life_table(scenario, Streams(run.seed, run.replica))
         self._absent: tuple[int, np.ndarray] = (-1, np.zeros(0, dtype=bool))
         self._restarts = slot_restarts(scenario, self._lives)
@@ -71,7 +71,7 @@ class SlotColumns(ErrorColumns):
         self._filters = self._begin()
 
     def _observe(self, slot: int) -> dict[int, Observation]:
-        return self._all_observations(slot)
+        return self._observations(slot)
 
     def _is_up(self, node: int, slot: int) -> bool:
         if not self._scenario.network.lives:
