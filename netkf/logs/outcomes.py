@@ -41,7 +41,8 @@ class Test(NamedTuple):
     p        : of a departure as large or larger by chance; nan where nothing can be tested
     unit     : of the departure: its standard error, or for a chi-square with ``freedom`` degrees
                of freedom what makes the noncentrality 1 if it is raised to ``power``
-    rise     : by how much the variance grows with the departure, as a share of that without one
+    rise     : by how much the variance grows with the departure, of a chi-square with its square,
+               as a share of that without one
     """
 
     what: str
@@ -66,7 +67,9 @@ class Test(NamedTuple):
             return float(ncx2.sf(limit, self.freedom, noncentrality)) - POWER
 
         noncentrality = float(brentq(miss, 1e-6, 100.0 * (limit + 10.0)))
-        return self.unit * float(noncentrality ** (1.0 / self.power))
+        found = self.unit * float(noncentrality ** (1.0 / self.power))
+        rest = 1.0 - self.rise * found**2
+        return found / math.sqrt(rest) if rest > 0.0 else math.nan
 
 
 def test_law(values: FloatArray, law: WaitingLaw) -> Test:
@@ -464,9 +467,13 @@ def test_constancy(outcomes: LogOutcomes) -> Test:
     statistic = blocks * (blocks + 2.0) * float((rho**2 / (blocks - lag)).sum())
     deviation = math.sqrt(square / blocks / packets.mean())
     slow = max(float(rho[0]), 0.0)
-    # Slow changes that are the share s of the variance of blocks make each correlation s.
-    unit = deviation * (LAGS * blocks) ** -0.25
-    return Test(what, deviation * math.sqrt(slow), float(chi2.sf(statistic, LAGS)), unit, LAGS, 4)
+    p = float(chi2.sf(statistic, LAGS))
+    # A step halfway that is the share s of the variance of blocks makes the correlations s seen.
+    seen = np.maximum(1.0 - 3.0 * lag / blocks, 0.0)
+    noise = deviation**2 * (1.0 - min(slow, 0.9))
+    scale = float((seen**2 / (blocks - lag)).sum()) * blocks * (blocks + 2.0)
+    unit = math.sqrt(noise) * scale**-0.25
+    return Test(what, deviation * math.sqrt(slow), p, unit, LAGS, 4, 1.0 / noise)
 
 
 def test_identical(counts: FloatArray, expected: FloatArray, spread: FloatArray, used: int) -> Test:

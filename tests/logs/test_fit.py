@@ -32,6 +32,7 @@ from netkf.logs.outcomes import (
     shared_fate,
     shared_law,
 )
+from netkf.logs.outcomes import test_constancy as constancy_test
 from netkf.logs.outcomes import test_identical as identity_test
 from netkf.logs.outcomes import test_time as time_test
 from netkf.scenario.writing import as_table
@@ -191,6 +192,9 @@ def test_departures_of_the_stated_size_are_found_with_the_stated_power():
         for r in seeds(100, 5)
     ]
     assert rate(other) > 0.75
+    step = constancy_test(drawn(np.random.default_rng(0), T=600)).detectable(LEVEL)
+    laws = (drawn(r, T=600, p=0.75, steps=(step, -step)) for r in seeds(200, 14))
+    assert 0.8 < rate(constancy_test(outcomes).p < LEVEL for outcomes in laws) < high
 
 
 def test_the_share_that_many_hearers_find_and_bursts_do_not_feign():
