@@ -26,9 +26,9 @@ from netkf.algorithms.kernels.run import (
     ClockTables,
     carry_mean,
     clock_tables,
+    longest_interval,
     move,
     predict_estimate,
-    usable,
 )
 from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.models import FlowModel
@@ -125,7 +125,7 @@ def use_sample_or_increments(record: Any, h: int, run: Any) -> None:
 @kernel
 def closed_loop_interval(record: Any, h: int, _run: Any) -> float:
     """Return the seconds of increments for one update: 1 / |L H|, the time scale of the gain."""
-    return usable(record.loops.rate[h])
+    return longest_interval(record.loops.rate[h])
 
 
 def constant_gain_record(

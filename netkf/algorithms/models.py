@@ -22,7 +22,7 @@ from netkf.algorithms.kernels.gains import GainTable, gain_table
 from netkf.algorithms.kernels.maps import MapTables, move_estimate, spread_of
 from netkf.algorithms.kernels.rates import DIFFERENCE, RateTables, move_by_rate, scratch_of_rates
 from netkf.algorithms.kernels.root_flow import FlowTable, flow_root, flow_table, gain_update_root
-from netkf.algorithms.kernels.run import CLOSE, usable
+from netkf.algorithms.kernels.run import CLOSE, longest_interval
 from netkf.algorithms.kernels.square_root import lower_root
 from netkf.linalg.arrays import (
     FloatArray,
@@ -123,7 +123,7 @@ class FlowModel:
         """Return the longest interval (s) for this root (n, n) of P, see ``Timing.interval``."""
         # trace(P G) = |R^-1/2 H S|^2, without forming P = S S' and G = H' R^-1 H.
         HS = self.flow.whitened_H[0] @ root
-        return usable(float((HS * HS).sum()))
+        return longest_interval(float((HS * HS).sum()))
 
 
 @dataclass(frozen=True, eq=False)

@@ -56,8 +56,6 @@ class Whitened(NamedTuple):
 
 
 _NO_READING = Whitened(np.zeros(0), np.zeros((0, 0)))
-OWN = 0
-"""The reading of ``update`` in the tables of a run; those of messages follow."""
 
 
 class Payload:

@@ -48,8 +48,6 @@ from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.rng.streams import Generators
 
 NEIGHBOURS = "neighbours"
-Pairs = tuple[tuple[int, int], ...]
-"""Nodes that read, each with one that it reads."""
 _pair = tuple_of(node_id(), node_id(), description="a pair of node ids")
 _targets = either(one_of(NEIGHBOURS), list_of(_pair, "pairs of node ids"), has_depth(1))
 

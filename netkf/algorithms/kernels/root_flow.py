@@ -72,15 +72,17 @@ BLOCKS = 13  # Legendre coefficients at most: the next one is below 1e-40 of the
 NEGLIGIBLE = 1e-18  # trace(P dG) of information that may be left out
 GROWTH = 2.0**8  # of F over one level at most, where something is observed
 PIVOT = 2.0**-48  # least pivot of Q_g, relative to its diagonal
+ROWS, USED_BLOCKS, USED_LEVELS, OCTAVES = range(4)
+"""Columns of ``FlowTable.sizes``."""
 
 
 class FlowTable(Struct):
     """Tables of M models: everything that depends neither on P nor on the gap.
 
     unit   : (M,) length of a cell, seconds
-    sizes  : (M, 5) rows q of a block of Gamma, number of blocks (0: nothing is observed), whether
-             there is noise, number of levels, and the level that is as long as all cells together
-    size   : (M,) trace of G, 1/s
+    sizes  : (M, 4) rows q of a block of Gamma, number of blocks (0: nothing is observed), number of
+             levels, and the level that is as long as all cells together: ROWS, USED_BLOCKS, ...
+    rate   : (M,) trace of G, 1/s
     reach  : (M, cells, terms, 1) up to which gap the terms so far are enough, see linalg/series
     series : (M, cells, terms, width) Taylor coefficients: Q_g (lower triangle by rows), exp(A g)
              and, if something is observed, F and G_g; then zeros up to a multiple of the lanes
@@ -93,7 +95,7 @@ class FlowTable(Struct):
 
     unit: FloatArray
     sizes: IntArray
-    size: FloatArray
+    rate: FloatArray
     reach: FloatArray
     series: FloatArray
     gamma: FloatArray
@@ -162,7 +164,7 @@ def flow_table(
     table.levels[:, :, :2] *= ratios
     table.levels[:, :, 2] /= units
     table.levels[:, :, 3] *= units[:, None]
-    table.whitened_H[0], table.size[0] = whitened_H, (whitened_H * whitened_H).sum()
+    table.whitened_H[0], table.rate[0] = whitened_H, (whitened_H * whitened_H).sum()
     # The triangle inequality over the terms bounds each entry for every gap up to the unit.
     powers = table.unit ** np.arange(TERMS)
     table.bound[:] = ((np.abs(table.gamma[..., 1:]) * powers[:, None]).sum(axis=2) ** 2).sum(axis=2)
@@ -170,7 +172,7 @@ def flow_table(
 
 
 def _tabulate(A: FloatArray, Q: FloatArray, whitened_H: FloatArray, longest: float) -> FlowTable:
-    """Return the table of one model, but for bounds and sizes, in the given units of states."""
+    """Return the table of one model, but for bounds and rates, in the given units of states."""
     n = len(A)
     M, scale = hamiltonian(A, Q, whitened_H.T @ whitened_H)
     size = np.abs(A)
@@ -208,11 +210,11 @@ def _tabulate(A: FloatArray, Q: FloatArray, whitened_H: FloatArray, longest: flo
     last_term = max(int(np.searchsorted(row[:-1], row[:-1].max(initial=0.0))) for row in reach)
     last_term += last_term % 2  # two terms at a time, see linalg/series
     reach[:, last_term] = np.inf
-    sizes = (len(whitened_H), len(blocks), int(bool(np.any(Q))), len(levels), octaves)
+    sizes = (len(whitened_H), len(blocks), len(levels), octaves)
     return FlowTable(
         unit=np.array([unit]),
         sizes=np.array([sizes], dtype=np.int64),
-        size=np.zeros(1),
+        rate=np.zeros(1),
         reach=reach[None, :, : last_term + 1, None].copy(),
         series=series[None, :, : last_term + 1].copy(),
         gamma=np.array(gamma).reshape(1, len(gamma), TERMS, len(whitened_H) * n + 1),
@@ -495,15 +497,15 @@ def propagate_root(
     """Propagate estimate ``k`` in place over ``gap`` seconds: ``P <- F P (I + G_g P)^-1 F' + Q_g``
     for any P, and the mean by exp(A gap), without the readings.
     """
-    # The cells cover 2^octaves units (column 4 of sizes). Of a longer gap, first take whole steps
+    # The cells cover 2^octaves units. Of a longer gap, first take whole steps
     # of the level of that length.
-    octaves, values = table.sizes[m, 4], work.values
+    octaves, values = table.sizes[m, OCTAVES], work.values
     if gap >= table.unit[m] * (1 << octaves):
         gap = propagate_by_levels(table, m, octaves, root, x, k, gap, work)
     if not gap > 0.0:
         return
-    # Without observation (no block of Gamma, column 1 of sizes) any P is narrow.
-    observed = table.sizes[m, 1] > 0
+    # Without observation (no block of Gamma) any P is narrow.
+    observed = table.sizes[m, USED_BLOCKS] > 0
     trace = trace_of_root(ONE, work.size, root[k]) if observed else 0.0
     if is_narrow(table, m, gap, trace):
         cell, since = cell_of(table.unit[m], gap)
@@ -526,8 +528,8 @@ def is_narrow(table: FlowTable, m: int, gap: float, trace: float) -> bool:
     """Return True if a P of this ``trace`` is small enough to be moved over ``gap`` seconds in one
     step by model ``m`` of the table: the rounding of G_g times P is harmless.
     """
-    # table.size is trace(G). ``not >=``: a nan counts as narrow, so that it takes the short way.
-    return not table.size[m] * gap * trace >= NARROW
+    # ``not >=``: a nan counts as narrow, so that it takes the short way.
+    return not table.rate[m] * gap * trace >= NARROW
 
 
 @kernel(inlined=True)
@@ -535,7 +537,7 @@ def takes_one_step(table: FlowTable, m: int, gap: float, trace: float) -> bool:
     """Return True if ``propagate_root`` moves a P of this ``trace`` over ``gap`` seconds in one
     step, by the series of a cell, with model ``m`` of the table: then SIMD lanes can do so.
     """
-    longest = table.unit[m] * (1 << table.sizes[m, 4])
+    longest = table.unit[m] * (1 << table.sizes[m, OCTAVES])
     return bool(gap < longest and is_narrow(table, m, gap, trace))
 
 
@@ -564,7 +566,7 @@ def propagate_by_levels(
     """Propagate estimate ``k`` in place over the whole multiples of ``unit 2^level`` seconds in a
     ``gap``; return the rest of the gap, seconds.
     """
-    length, levels = table.unit[m] * (1 << level), table.sizes[m, 3]
+    length, levels = table.unit[m] * (1 << level), table.sizes[m, USED_LEVELS]
     steps = int(gap / length)
     rest: float = gap - steps * length
     while steps > 0:
@@ -587,7 +589,7 @@ def propagate_level(
     # Index in the third axis of levels: 0 exp(A g), 1 F, 2 Gamma, 3 T. Column 1 of sizes is 0 where
     # nothing is observed.
     size, n, levels, T = work.size, len(work.size), table.levels, work.T
-    values, row, observed = work.values, work.observed, table.sizes[m, 1] > 0
+    values, row, observed = work.values, work.observed, table.sizes[m, USED_BLOCKS] > 0
     # Gamma_r S for each row r of Gamma, both triangular, as an observation of unit noise.
     for r in range(n if observed else 0):
         for j in range(n):
@@ -644,7 +646,7 @@ def propagate_by_series(
     rows. ``reads``: use G_g first; otherwise the caller has done so.
     """
     # Work on copies that the compiler can keep in registers (local_matrix), and store them last.
-    size, n, observed = scratch.size, len(scratch.size), table.sizes[m, 1] > 0
+    size, n, observed = scratch.size, len(scratch.size), table.sizes[m, USED_BLOCKS] > 0
     S, mean = local_matrix(size, scratch.S), local_vector(size, scratch.mean)
     for i in range(n):
         mean[i] = x[k, i]
@@ -739,11 +741,11 @@ def use_information(
     below one unit, row by row of Gamma, as observations of unit noise. Block j of q rows is
     ``gap^(j + 1/2)`` times a power series in gap.
     """
-    n, q, rows, observed = len(scratch.size), table.sizes[m, 0], scratch.rows, scratch.observed
+    n, q, rows, observed = len(scratch.size), table.sizes[m, ROWS], scratch.rows, scratch.observed
     gamma, width = table.gamma, q * n
     trace = trace_of_root(ONE, scratch.size, root[k])
     factor = math.sqrt(gap)
-    for block in range(table.sizes[m, 1]):
+    for block in range(table.sizes[m, USED_BLOCKS]):
         # The information of block j shrinks with g^(2 j + 1): stop when it is below rounding.
         if table.bound[m, block] * factor * factor * trace < NEGLIGIBLE:
             break

@@ -598,11 +598,11 @@ def max_increment_interval(record: Any, h: int, run: Any) -> float:
     """
     table = run.model.table
     m = run.model.models[h]
-    return usable(information_rate(ONE, run.size, table.whitened_H[m], record.root[h]))
+    return longest_interval(information_rate(ONE, run.size, table.whitened_H[m], record.root[h]))
 
 
 @kernel
-def usable(rate: float) -> float:
+def longest_interval(rate: float) -> float:
     """Return the longest interval (s) of increments for one update, by the ``rate`` (1/s)."""
     return MAX_RELATIVE_GAIN / rate if rate > 0.0 else math.inf
 

@@ -35,9 +35,9 @@ from netkf.engines.compiled.truth import PathStates
 from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import LinkClock
 from netkf.network.node_clocks import NodeTime
-from netkf.plants.diffusion import NO_TIMES
 from netkf.plants.paths import BLOCK
 from netkf.plants.transitions import frame_period
+from netkf.plants.truth import WithoutFrames
 from netkf.rng.streams import Streams
 from netkf.scenario.sampling import uses_grid
 from netkf.scenario.scenario import Scenario
@@ -202,7 +202,7 @@ def batch_size(scenario: Scenario) -> int:
     rows = max((len(sensor.R) for sensor in scenario.sensors), default=0)
     if sensors is not None:
         # Per sample its time, state, value and a few indices.
-        taken = sum(float(rates.sum()) for *_, rates in sensors.clocks) * scenario.horizon
+        taken = sum(float(entry.rates.sum()) for entry in sensors.clocks) * scenario.horizon
         floats = taken * (8 + n + rows)
     else:
         period = scenario.diffusion.sensing_period
@@ -296,10 +296,8 @@ class BatchDraws:
         return self._paths.block(self._block, together)
 
 
-class KnownStates:
+class KnownStates(WithoutFrames):
     """The states ``x`` (R, T, n) of R runs at all sample times, whose origin does not move."""
-
-    frame_times = NO_TIMES
 
     def __init__(self, x: FloatArray) -> None:
         self._x = x
@@ -311,7 +309,3 @@ class KnownStates:
     def of_runs(self, _: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the states, local and absolute ones."""
         return self._x, self._x
-
-    def rebase(self, k: int) -> FloatArray:
-        """Raise IndexError: there is no frame number ``k``."""
-        raise IndexError(k)

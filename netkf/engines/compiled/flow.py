@@ -194,8 +194,9 @@ class Workspace:
     def begin(
         self, draws: Any, traced: bool, buffer: SampleBuffer | None = None, together: int = 1
     ) -> Simulation:
-        """Return the state at time 0 of ``together`` runs with the random numbers of ``draws``,
-        which write samples into ``buffer`` (None: the workspace's own), and rows if ``traced``.
+        """Return the state at time 0 of ``together`` runs with the random numbers of ``draws``, a
+        Source or ``batches.BatchDraws``, which write samples into ``buffer`` (None: the workspace's
+        own), and rows if ``traced``.
         """
         start, instants, window = self.filters, draws.instants, draws.window()
         changes = np.array(self._scenario.followed_changes)

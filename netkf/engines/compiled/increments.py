@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from netkf.algorithms.kernels.root_flow import gain_root, propagate_root
-from netkf.algorithms.kernels.run import interval_end, usable
+from netkf.algorithms.kernels.run import interval_end, longest_interval
 from netkf.engines.base import LONGER, MIN_GAP_SHARE
 from netkf.engines.compiled.state import PathBlock, Sensing, Simulation
 from netkf.linalg.arrays import FloatArray
@@ -139,7 +139,7 @@ def next_interval(rate: float, now: float, time: float, least: float) -> tuple[f
     """Return where the next measurement interval from ``now`` to at most ``time`` (seconds) ends,
     short against the ``rate`` trace(P G) in 1/s, and the least next length, at first 0.
     """
-    end, interval = time, usable(rate)
+    end, interval = time, longest_interval(rate)
     if interval < time - now:
         # A lower bound that is set once per gap: a diverging P would make intervals ever shorter.
         if least == 0.0:

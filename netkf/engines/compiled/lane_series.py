@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from netkf.algorithms.kernels.root_flow import CELL_BYTES
+from netkf.algorithms.kernels.root_flow import CELL_BYTES, USED_BLOCKS
 from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.state import Filters, filters_at_start
 from netkf.linalg.arrays import FloatArray, IntArray
@@ -60,7 +60,7 @@ def series_of_lanes(scenario: Scenario) -> tuple[LaneSeries, LaneSeries]:
     period = float(scenario.diffusion.sensing_period or 0.0)
     n, table = filters.xhat.shape[1], filters.table
     # Column 1 counts the blocks of observation rows: 0 if the model has no sensor.
-    selected = table.sizes[:, 1] == 0
+    selected = table.sizes[:, USED_BLOCKS] == 0
     width = n * (n + 1) // 2 + n * n
     # Q_g, the covariance of the noise over the gap g (a triangle), and exp(A g).
     unobserved = _united(table.series[selected][..., :width], table.unit[selected], selected)
@@ -84,7 +84,7 @@ def sensing_series(filters: Filters, period: float) -> LaneSeries:
         (kernels.gains)
     """
     n, table = filters.xhat.shape[1], filters.table
-    width, selected = n * (n + 1) + 2 * n * n, table.sizes[:, 1] > 0
+    width, selected = n * (n + 1) + 2 * n * n, table.sizes[:, USED_BLOCKS] > 0
     # Readings of more than a step of the sensing grid are never used at once.
     cells = min(table.series.shape[1], math.ceil(period / table.unit.min()) + 1)
     unit = table.unit[selected]

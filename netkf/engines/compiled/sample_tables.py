@@ -71,13 +71,24 @@ def samples_of(scenario: Scenario, streams: Streams) -> SampleInstants:
     return cls(scenario, streams)
 
 
-class KernelSensors(NamedTuple):
-    """What is drawn of S linear sensors, in the order of ``_placed_sensors``: the ``clocks`` of
-    their entries, each with the indices of its sensors, the ``keys`` of their streams, and the
-    Cholesky factors ``root`` (S, p, p) of the true R.
+class EntryClock(NamedTuple):
+    """The clock of K sensors of one entry: their ``indices`` (K,), the ``keys`` of their streams,
+    and their ``rates`` (K,) in 1/s.
     """
 
-    clocks: list[tuple[LinkClock, np.ndarray, list[tuple[int, int]], FloatArray]]
+    clock: LinkClock
+    indices: np.ndarray
+    keys: list[tuple[int, int]]
+    rates: FloatArray
+
+
+class KernelSensors(NamedTuple):
+    """What is drawn of S linear sensors, in the order of ``_placed_sensors``: the ``clocks`` of
+    their entries, the ``keys`` of their streams, and the Cholesky factors ``root`` (S, p, p) of the
+    true R.
+    """
+
+    clocks: list[EntryClock]
     keys: list[tuple[int, int]]
     root: FloatArray
 
@@ -103,7 +114,8 @@ def kernel_sensors(scenario: Scenario) -> KernelSensors | None:
         indices = np.flatnonzero(np.array(entries) == entry)
         clock: Any = parts[indices[0]].sampling
         own = [keys[k] for k in indices]
-        clocks.append((clock, indices, own, np.array([clock.mean_rate(key) for key in own])))
+        rates = np.array([clock.mean_rate(key) for key in own])
+        clocks.append(EntryClock(clock, indices, own, rates))
         R = cholesky(parts[indices[0]].R)
         root[indices, : len(R), : len(R)] = R
     return KernelSensors(clocks, keys, root)
@@ -118,10 +130,7 @@ class KernelSamples:
         sensors = kernel_sensors(scenario)
         assert sensors is not None
         self._tables, self._root = _sensor_tables(scenario), sensors.root
-        parts = [
-            self._times(scenario, streams, clock, own, rates, indices)
-            for clock, indices, own, rates in sensors.clocks
-        ]
+        parts = [self._times(scenario, streams, entry) for entry in sensors.clocks]
         t, stream = (np.concatenate(column) for column in zip(*parts, strict=True))
         # Streams are numbered run by run.
         run, sensor = np.divmod(stream, len(sensors.keys))
@@ -134,20 +143,16 @@ class KernelSamples:
 
     @staticmethod
     def _times(
-        scenario: Scenario,
-        streams: Streams,
-        clock: LinkClock,
-        own: list[tuple[int, int]],
-        rates: FloatArray,
-        indices: np.ndarray,
+        scenario: Scenario, streams: Streams, entry: EntryClock
     ) -> tuple[FloatArray, np.ndarray]:
         """Return times (K,) and numbers of streams (K,) of all samples of one entry."""
+        clock, indices, keys, rates = entry
         expected = scenario.horizon * float(rates.sum()) * streams.runs
-        space = int(expected + 8.0 * math.sqrt(expected)) + len(own) * streams.runs + 8
+        space = int(expected + 8.0 * math.sqrt(expected)) + len(keys) * streams.runs + 8
         numbers = indices + len(_placed_sensors(scenario)) * np.arange(streams.runs)[:, None]
         purposes, per_second = ("sampling", "sampling phase"), scenario.time_grid.per_second
         while True:
-            clocks = clocks_of(clock, own, rates, streams, purposes, per_second)
+            clocks = clocks_of(clock, keys, rates, streams, purposes, per_second)
             t, entity = np.empty(space), np.empty(space, dtype=np.int64)
             tables = ziggurat(), normal_ziggurat()
             count = draw_instants(clocks, scenario.horizon, *tables, t, entity)

@@ -16,6 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from netkf.algorithms.kernels.root_flow import (
+    OCTAVES,
     cell_of,
     cholesky_in_lanes,
     condition_root,
@@ -184,8 +185,7 @@ def empty_visits(
         first=np.full(capacity + 2, -1, dtype=np.int64),
         pairs=np.zeros(capacity, dtype=np.int64),
         model=np.tile(model, places // len(nodes)),
-        # Column 4 is the first level (a gap of 2^level units) that is longer than all cells.
-        longest=table.unit * 2.0 ** table.sizes[:, 4],
+        longest=table.unit * 2.0 ** table.sizes[:, OCTAVES],
         weight_row=weight_row,
         readings=empty_readings(filters),
         exchange=exchange,
