@@ -472,7 +472,8 @@ def test_constancy(outcomes: LogOutcomes) -> Test:
     seen = np.maximum(1.0 - 3.0 * lag / blocks, 0.0)
     noise = deviation**2 * (1.0 - min(slow, 0.9))
     scale = float((seen**2 / (blocks - lag)).sum()) * blocks * (blocks + 2.0)
-    unit = math.sqrt(noise) * scale**-0.25
+    # The step that blocks show is larger or smaller by chance, in all correlations alike.
+    unit = math.sqrt(noise) * scale**-0.25 * (1.0 + 0.8 / math.sqrt(blocks))
     return Test(what, deviation * math.sqrt(slow), p, unit, LAGS, 4, 1.0 / noise)
 
 
