@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
+from decimal import localcontext
 from pathlib import Path
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import as_path, number
+from netkf.core.stamps import EXACT
 from netkf.logs.mercator import read_mercator
 from netkf.logs.mrclam import read_mrclam
 from netkf.logs.packet_tables import read_tables
@@ -70,8 +72,9 @@ def import_log(
         base = as_path("like", like) if like is not None else log / "scenario.toml"
         name = re.sub(r"[^\w-]", "_", log.resolve().name.partition(".")[0]) or "log"
         scenario = load(base, trust=trust) if like is not None or base.is_file() else None
-        packets = read_tables(log, columns or {}) if kind == "csv" else DATA_SETS[kind](log)
-        files, notes = write_network(packets, name, hole, unreported, scenario)
+        with localcontext(EXACT):  # stamps have more digits than the caller's context may keep
+            packets = read_tables(log, columns or {}) if kind == "csv" else DATA_SETS[kind](log)
+            files, notes = write_network(packets, name, hole, unreported, scenario)
     paths = [folder / name for name in sorted(files, key="scenario.toml".__ne__)]
     write_folder(folder, files)
     return tuple(paths), notes

@@ -15,6 +15,7 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import covariance, definite_covariance, matrix, positive, vector
+from netkf.core.stamps import EXACT
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import noise_root
 from netkf.plants.transitions import decimal_below
@@ -89,7 +90,7 @@ def _dynamics(dt: Any, A: FloatArray, gain: FloatArray, noise: FloatArray) -> di
         fastest = float(np.abs(np.linalg.eigvals(A)).max()) or 1.0
         horizon = decimal_below(TIME_CONSTANTS / fastest)
         plant = {"kind": "diffusion", "A": A, "B": gain @ noise_root(noise)}
-        probe = float(Decimal(repr(horizon)) / SAMPLES)
+        probe = float(EXACT.divide(Decimal(repr(horizon)), SAMPLES))
         return {"plant": plant, "horizon": horizon, "probe": probe}
     table = _slots(1.0 if dt is True else dt)
     table["plant"] |= {"F": A, "Q": gain @ noise @ gain.T}
@@ -136,7 +137,7 @@ def _shaped(key: str, value: FloatArray, rows: int, hint: str = "correct it") ->
 
 def _slots(period: Any) -> dict[str, Any]:
     period = positive("period", period)
-    horizon = float(SLOTS * Decimal(repr(period)))
+    horizon = float(EXACT.multiply(SLOTS, Decimal(repr(period))))
     return {"horizon": horizon, "probe": period, "plant": {"kind": "linear", "period": period}}
 
 

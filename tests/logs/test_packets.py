@@ -3,7 +3,7 @@
 import gzip
 import math
 import os
-from decimal import Decimal
+from decimal import Decimal, localcontext
 
 import networkx
 import numpy as np
@@ -120,6 +120,10 @@ def test_columns_of_any_name(tmp_path, capsys):
     sent = table(out, "transmissions.csv")
     assert np.diff(sent["t"]).tolist() == [1.5]
     assert table(out, "outcomes.csv")["delivered"].tolist() == [1, 0]
+    given = dict(column.split("=") for column in columns.split(","))
+    with localcontext(prec=1):  # of the caller
+        netkf.import_log(log, "csv", tmp_path / "again", columns=given)
+    assert np.diff(table(tmp_path / "again", "transmissions.csv")["t"]).tolist() == [1.5]
     assert main([*words[:2], "--kind", "csv", "--out", str(tmp_path / "no")]) == 2
     assert "name them: --columns t=COLUMN,..." in capsys.readouterr().err
     for wrong, said in (
