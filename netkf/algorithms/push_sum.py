@@ -510,7 +510,7 @@ DECIDING = replace(SLOTS, decides=True, depends_on_data=False)
 class PushSum(Filter):
     """In slots Battilotti et al., P Fig. 1, whose samples show estimates after readings; under node
     clocks broadcast rounds by running sums (``algorithms.running_sums``), which use none of the
-    settings. All methods serve both: under clocks the state is a ``RunningSums``.
+    settings. All methods serve both; the fields of their states differ.
 
     gamma      averaging steps a slot
     delta      the averaging gain is 1 / delta, P (9)

@@ -23,7 +23,7 @@ from netkf.core.fields import as_class
 
 F = TypeVar("F", bound=type[Filter])
 
-_REGISTERED: dict[str, type[Filter]] = {}  # by name, see choice_name
+_REGISTERED: dict[str, type[Filter]] = {}  # by name, see split_choice
 
 LINK_WEIGHTS = ("link_weights",)
 """What a derived class may override without losing the theory, which asks it for its weights."""
@@ -53,7 +53,7 @@ def split_choice(name: str) -> tuple[str, dict[str, str]]:
 
 @cache
 def built_in_filters() -> dict[str, type[Filter]]:
-    """Return all built-in filters by name (``choice_name``)."""
+    """Return all built-in filters by name (``split_choice``)."""
     # Importing a module registers its filters: no list of them has to be kept.
     for module in pkgutil.iter_modules(netkf.algorithms.__path__, "netkf.algorithms."):
         if not module.ispkg:

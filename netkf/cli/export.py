@@ -50,7 +50,7 @@ def _write_folder(run: Any, options: argparse.Namespace) -> int:
     *files, last = (export_recorded if recorded else export_log)(run, options.out)
     print(f"written: {last} with {', '.join(path.name for path in files)}")
     if recorded:
-        replica = f" --replica {run.replica}" * bool(run.replica)
+        replica = f" --replica {run.replica}" if run.replica else ""
         print(f"next: netkf run {shlex.quote(str(last))}{replica}")
     else:
         print(f"next: netkf import {shlex.quote(str(options.out))} --kind csv --out DIR")

@@ -206,7 +206,7 @@ class _Entries:
             value = math.nan
         if not math.isfinite(value):
             remedy = "write a decimal point, no commas" if "," in text else "correct the entry"
-            remedy += ", or leave it empty if it is missing" * may_miss
+            remedy += ", or leave it empty if it is missing" if may_miss else ""
             raise self._refusal(column, "must be a finite number", remedy)
         return self._limited(column, value)
 
@@ -235,7 +235,7 @@ class _Entries:
         if source.node_ids is None and len(name) <= MAX_NAME and name.isprintable():
             return source.unknown.setdefault(name, -1 - len(source.unknown))
         remedy = f"{suggest_nearest(name, source.node_ids or ())}correct it, or the graph"
-        remedy += "; landmarks have numbers" * (self._header[column] == "to")
+        remedy += "; landmarks have numbers" if self._header[column] == "to" else ""
         raise self._refusal(column, "must name a node of the graph", remedy)
 
     def stamp(self, column: int) -> float:

@@ -381,8 +381,8 @@ def instance_of(*classes: type) -> Rule:
 
 def stated(*classes: type, optional: bool = False) -> Rule:
     """Return the rule for what a class states as an object of one of the ``classes``, or None."""
-    names = " or ".join(cls.__name__ for cls in classes) + " or None" * optional
-    convert = instance_of(*classes, *[type(None)] * optional).convert
+    names = " or ".join(cls.__name__ for cls in classes) + (" or None" if optional else "")
+    convert = instance_of(*classes, *([type(None)] if optional else [])).convert
     return Rule(f"must be {names}", convert, "see netkf.parts")
 
 

@@ -57,7 +57,7 @@ def one_line(text: object) -> str:
 
 def list_some(values: Sequence[object], most: int) -> str:
     """Return ``values`` as a list, "1, 2, ..." where there are more than ``most``."""
-    return ", ".join(map(str, values[:most])) + ", ..." * (len(values) > most)
+    return ", ".join(map(str, values[:most])) + (", ..." if len(values) > most else "")
 
 
 def count_phrase(count: int, what: str) -> str:

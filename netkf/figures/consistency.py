@@ -36,8 +36,10 @@ def nees_figure(data: FigureData) -> style.Picture:
     inside = float(((values >= low) & (values <= high))[known].mean())
     divisor = f" over {data.runs:,} runs" if data.runs > 1 else ""
     freedom = " and ".join(f"{data.runs * size:,}" for size in sorted(set(sizes)))
-    note = f"Band: chi-square with {freedom} degree{'s' * (freedom != '1')} of freedom{divisor}."
-    note += f" Errors of {data.scenario.states_note}." * bool(data.scenario.states_note)
+    degrees = "degree" if freedom == "1" else "degrees"
+    note = f"Band: chi-square with {freedom} {degrees} of freedom{divisor}."
+    if data.scenario.states_note:
+        note += f" Errors of {data.scenario.states_note}."
     headline = f"{inside:.0%} of the samples lie in the {CONFIDENCE:.0%} band of NEES; their mean "
     mean = float((values / unit)[known].mean())
     headline += f"{'is' if len(set(sizes)) == 1 else 'over n is'} {mean:.3g} where exact "
@@ -124,7 +126,7 @@ def whiteness_figure(data: FigureData) -> style.Picture:
     read = data.scenario.label_of_value(worst, 0, innovations.rows[innovations.nodes == worst])
     place = data.scenario.topology.index.get(worst)
     name = "all readings" if place is None else f"node {data.nodes[place]}"
-    _draw_correlations(axes, curves, (worst, name + f", {read}" * bool(read)), band, lags)
+    _draw_correlations(axes, curves, (worst, f"{name}, {read}" if read else name), band, lags)
     share = outside / (lags * len(curves))
     judgement = (
         "as expected of white noise" if share <= WHITE_SHARE else "so innovations are not white"

@@ -245,7 +245,7 @@ def _tell_channels(
     what = "drawn, once, by how likely they are" if differ else "that of the others is not used"
     notes.append(
         f"{untold:,} of them are of packets whose channel nobody tells: {what}"
-        + "; the test of channels is of the others" * bool(test)
+        + ("; the test of channels is of the others" if test else "")
     )
     if differ:
         return stats.draw_channels(table, np.random.default_rng(seed)), test

@@ -366,7 +366,7 @@ def fill_cubic(
     cubic that is 0 at u = 0 and ``end`` at u = 1, and has the moments ``plain`` and ``tilt``:
     what the noise contributed to x.
     """
-    # With e = length end, M_0 = plain and S_1 = 3 tilted these conditions give the coefficients
+    # With e = gap end, M_0 = plain and S_1 = 3 tilt these conditions give the coefficients
     # 6 M_0 - 10 S_1 + 3 e, 30 S_1 - 6 M_0 - 12 e and 10 e - 20 S_1.
     last, slope = gap * end, 3.0 * tilt
     cubic[run, row, 0, i] = 6.0 * plain - 10.0 * slope + 3.0 * last

@@ -74,7 +74,7 @@ class ReadingTable:
         """
         header = read_header(path)
         self.path, self._R = path, R
-        self.regressors = linear * sum(number_of(name, "phi") >= 0 for name in header)
+        self.regressors = sum(linear and number_of(name, "phi") >= 0 for name in header)
         self.p = p = 1 if self.regressors else p
         self.has_anchors = not linear and "to" in header
         triangle = {f"R{i}{j}": (i, j) for i in range(p) for j in range(i, p)}
@@ -97,7 +97,8 @@ class ReadingTable:
     def columns(self) -> Columns:
         """The columns of the table; values and their noises may be missing."""
         values = [f"y{k}" for k in range(self.p)]
-        others = [f"phi{k}" for k in range(self.regressors)] + ["to"] * self.has_anchors
+        others = [f"phi{k}" for k in range(self.regressors)]
+        others += ["to"] if self.has_anchors else []
         required = ("t", "node", *values, *others, *self._noise)
         gaps = {*values, *self._noise, *self._surplus}
         columns = read_columns(self.path, required, tuple(self._surplus), gaps)

@@ -55,6 +55,9 @@ def page(result: Any, other: Any = None, *, replica: int | str | None = None) ->
             directory = getattr(one, "directory", one)
             if directory is one and isinstance(one, Run | Ensemble):
                 directory = _write(one, Path(folder) / f"RUN{k + 1}")
+            elif directory is not one and directory.is_relative_to(Path.cwd()):
+                # As the command on the page names it here.
+                directory = directory.relative_to(Path.cwd())
             remedy = "give a run, an ensemble or its directory"
             directories.append(as_path("result", directory, remedy))
         # The command on the page names no folder that is gone.

@@ -202,7 +202,7 @@ def _assemble_page(
     ]
     runs = [first for first, *_ in choices]
     rules = [
-        f"{run['words']}{': ' * bool(run['words'])}{rule}"
+        f"{run['words']}{': ' if run['words'] else ''}{rule}"
         for data in choices
         for run in data
         for rule in thinning_rules(run)

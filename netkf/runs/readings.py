@@ -94,7 +94,7 @@ def collect_readings(
             rows = np.searchsorted(times, times_of[key])
             own = _readings_of(scenario, streams, (node, one), numbers[key], rows, states - origin)
             at = scenario.time_grid.snap(times + _sensing_delay(scenario))
-            pauses = [one for one in down if one.node == node]
+            pauses = [pause for pause in down if pause.node == node]
             readings += (r for r in own if not any(p.begin <= at[r.number] < p.end for p in pauses))
     readings.sort(key=lambda one: one.number)
     return RunReadings(times, readings, run, origin)

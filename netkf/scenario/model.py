@@ -393,7 +393,7 @@ class ScenarioModel(Component):
             if any(plant.labels):
                 whose = f"{name}: " if self.views is not None else ""
                 parts.append(whose + ", ".join(labels[:MAX_LABELS]))
-                parts[-1] += ", ..." * (len(labels) > MAX_LABELS)
+                parts[-1] += ", ..." if len(labels) > MAX_LABELS else ""
         return f"states: {'; '.join(parts)}" if parts else ""
 
     def labels_of_readings(self, node: int) -> list[str]:
@@ -433,7 +433,7 @@ class ScenarioModel(Component):
     def what_is_read(self, node: int) -> str:
         """Return what a ``node`` (-1: all) reads, as ``x (m), y (m)``; empty if it is unknown."""
         labels = list(dict.fromkeys(self.labels_of_readings(node)))
-        more = ", ..." * (len(labels) > MAX_LABELS)
+        more = ", ..." if len(labels) > MAX_LABELS else ""
         return ", ".join(labels[:MAX_LABELS]) + more if all(labels) else ""
 
     @property

@@ -256,7 +256,7 @@ def _require_part(family: str, kind: str, cls: Any) -> type[Component] | None:
     # A filter has kernels, or says in Python what it does with messages, if it has any.
     talks = getattr(getattr(cls, "timing", None), "talks", True)
     if family == "filter" and getattr(cls, "kernels", None) is None and talks:
-        missing += ["absorb"] * (vars(base)["absorb"] is getattr(cls, "absorb", None))
+        missing += ["absorb"] if vars(base)["absorb"] is getattr(cls, "absorb", None) else []
     rule = f"must define {', '.join(missing)}" if missing else ""
     try:
         if not is_netkf_class(cls):

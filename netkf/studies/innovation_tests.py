@@ -262,7 +262,7 @@ def _judge_node(
     reasons = [reason for reason, holds in (
         (f"NIS above {high:.3g}", bool(law.kind) and mean > high),
         (f"NIS below {low:.3g}", law.kind in ("white", "exact") and mean < low),
-        ("biased" + f" in {label}" * bool(label), bool(law.kind) and abs(bias) > reach),
+        (f"biased in {label}" if label else "biased", bool(law.kind) and abs(bias) > reach),
         ("correlated", is_white and whiteness.p < level),
     ) if holds]  # fmt: skip
     if is_white and not reasons and stretch.p < level:
@@ -402,9 +402,11 @@ def format_innovations(tests: InnovationTests, full: bool = True) -> str:
         largest = np.fmax.reduce(values).tolist()
         text = "found with probability 0.9 at every node judged: a mean NIS of {:.3g}, a bias of {}"
         white = tests.law.kind == "white" and math.isfinite(largest[2])
-        text += ", a correlation at one lag of {:.3g}" * white
+        text += ", a correlation at one lag of {:.3g}" if white else ""
         # Biases of different units do not compare.
         found = sorted((row.label, row.bias_detectable) for row in judged)
-        largest[1] = ", ".join(f"{b:.3g}" + f" in {of}" * bool(of) for of, b in dict(found).items())
+        largest[1] = ", ".join(
+            f"{b:.3g} in {of}" if of else f"{b:.3g}" for of, b in dict(found).items()
+        )
         lines.append(text.format(*largest))
     return "\n".join(lines)

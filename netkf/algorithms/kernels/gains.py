@@ -40,12 +40,11 @@ class GainTable(NamedTuple):
     """Power series in the interval g (seconds) of the gains U + P(b) W, U and W (n, 2p), and of the
     predictor C (2p, n) of the moments, for readings of p rows.
 
-    n, moments : number of states, and 2p
+    moments : 2p
     series : (terms, 6 n p + 1), the coefficients of U, W and C by rows, and their reach in the
              last column: the longest interval for which the terms so far suffice, see linalg/series
     """
 
-    n: int
     moments: int
     series: FloatArray
 
@@ -88,7 +87,7 @@ def gain_table(
     """
     n, p = len(A), len(H)
     if p == 0:
-        return GainTable(n, 0, np.zeros((0, 1)))
+        return GainTable(0, np.zeros((0, 1)))
     # In units in which entries are of about the same size, powers of 2, see root_flow.
     units = state_units(A, Q, H.T @ np.linalg.solve(R, H))
     A, Q, H = change_units(units, A, Q, H)
@@ -123,7 +122,7 @@ def gain_table(
     table = with_reach(series, longest)
     of_U = np.repeat(units, MOMENTS * p)
     table[:, :-1] *= np.concatenate([of_U, 1.0 / of_U, np.tile(1.0 / units, MOMENTS * p)])
-    return GainTable(n, MOMENTS * p, table)
+    return GainTable(MOMENTS * p, table)
 
 
 def longest_interval(A: FloatArray, Q: FloatArray, G: FloatArray) -> float:

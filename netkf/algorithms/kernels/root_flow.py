@@ -586,8 +586,7 @@ def propagate_level(
     table: FlowTable, m: int, level: int, root: FloatArray, x: FloatArray, k: int, work: FlowScratch
 ) -> None:
     """Propagate estimate ``k`` over ``unit 2^level`` s by the tabulated exp(A g), F, Gamma, T."""
-    # Index in the third axis of levels: 0 exp(A g), 1 F, 2 Gamma, 3 T. Column 1 of sizes is 0 where
-    # nothing is observed.
+    # Index in the third axis of levels: 0 exp(A g), 1 F, 2 Gamma, 3 T.
     size, n, levels, T = work.size, len(work.size), table.levels, work.T
     values, row, observed = work.values, work.observed, table.sizes[m, USED_BLOCKS] > 0
     # Gamma_r S for each row r of Gamma, both triangular, as an observation of unit noise.

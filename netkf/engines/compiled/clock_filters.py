@@ -62,12 +62,12 @@ class ClockFilters:
         self._first_models = np.ascontiguousarray(start.nodes["model"])
         self._silent = np.zeros(len(start.nodes), dtype=bool)
         self.run = self._run_of(scenario, start, links, messages)
-        self._run = self.run.general
+        self._general_run = self.run.general
         reads = bool((start.nodes["sensors"] > start.nodes["sensor"]).any())
         own_models = NO_MODELS
         if self._rates:
             # The loop passes the model on, whatever it is.
-            self._run = self.run if is_plain() else ClockRun.at(self.run)
+            self._general_run = self.run if is_plain() else ClockRun.at(self.run)
             if scenario.views is not None and not pooled:
                 self._own_models = [model.tables() for model in self._rates]
                 own_models = np.stack([tables.memory for tables in self._own_models])
@@ -188,10 +188,12 @@ class ClockFilters:
 
     def advance(self, state: Simulation) -> int:
         """Run the event loop until it needs something from Python; return its request."""
-        request = int(clock_loop(state, any_struct(self.record), self._run, self._verbs))
-        for one in (*self._rates, self._readings and self._readings.setup):
-            if one is not None:
-                one.raise_error()
+        record, run = any_struct(self.record), self._general_run
+        request = int(clock_loop(state, record, run, self._verbs))
+        for model in self._rates:
+            model.raise_error()
+        if self._readings is not None:
+            self._readings.setup.raise_error()
         return request
 
     def simulate(self, state: Simulation, batch: BatchArrays) -> dict[str, FloatArray]:
@@ -203,7 +205,7 @@ class ClockFilters:
         records = any_struct(self.record), any_struct(self.start)
         while run < runs:
             after = run + 1 if self._conserved else runs
-            arguments = *records, self._run, self._verbs, batch.memory, run, after, resumed
+            arguments = *records, self._general_run, self._verbs, batch.memory, run, after, resumed
             run = int(batch_loop(state, *arguments))
             # A run stops only if the pool of messages is too small.
             resumed = run < after

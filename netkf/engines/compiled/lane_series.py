@@ -59,7 +59,7 @@ def series_of_lanes(scenario: Scenario) -> tuple[LaneSeries, LaneSeries]:
     filters = filters_at_start(scenario)
     period = float(scenario.diffusion.sensing_period or 0.0)
     n, table = filters.xhat.shape[1], filters.table
-    # Column 1 counts the blocks of observation rows: 0 if the model has no sensor.
+    # Models without a sensor.
     selected = table.sizes[:, USED_BLOCKS] == 0
     width = n * (n + 1) // 2 + n * n
     # Q_g, the covariance of the noise over the gap g (a triangle), and exp(A g).

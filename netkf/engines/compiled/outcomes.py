@@ -238,24 +238,22 @@ def list_outcomes(
     for run, one in enumerate(streams.per_replica):
         of_run = [np.empty(0)] * len(senders.directions)
         conditions = conditions_of(channel.loss, one, scenario.horizon)
-        of_run_ticks = ticks[run * entities : (run + 1) * entities]
-        shared = _shared_draws(scenario, one, senders, of_run_ticks)
-        waits = _waits(scenario, one, senders, of_run_ticks, moving and moving.heard)
-        for e in range(entities):
-            times = of_run_ticks[e]
+        own_ticks = ticks[run * entities : (run + 1) * entities]
+        shared = _shared_draws(scenario, one, senders, own_ticks)
+        waits = _waits(scenario, one, senders, own_ticks, moving and moving.heard)
+        for e, times in enumerate(own_ticks):
             draws, last = (np.empty(0), np.empty(0), np.empty(0)), -1
             for w in senders.outgoing[senders.first[e] : senders.first[e + 1]].tolist():
                 # Directions that share a stream share its draws.
                 if senders.source[w] != last:
                     last = int(senders.source[w])
                     draws = sampler_of(channel, one, senders.sources[last]).draws(len(times))
-                first, heard = scenario.transmission(senders.directions[w]), slice(None)
-                (uniform, bad, delay), common = draws, shared.get((e, first.link[0]))
-                if common is not None:
+                uniform, bad, delay = draws
+                first = scenario.transmission(senders.directions[w])
+                heard = slice(None) if moving is None else moving.heard[w]
+                if (common := shared.get((e, first.link[0]))) is not None:
                     uniform = np.where(np.isnan(common.uniform), uniform, common.uniform)
                     bad = bad if common.bad is None else common.bad
-                if moving is not None:
-                    heard = moving.heard[w]
                 if moving is not None and scenario.links_move and channel.loss.follows_distance:
                     first = first._replace(distance=moving.distance[w][heard])
                 sent = first._replace(

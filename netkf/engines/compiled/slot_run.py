@@ -612,6 +612,7 @@ class SlotRuns:
                     readings[b, :, lane] = bad.given(self._slot + k, healthy)
 
     def _silence(self, y: FloatArray, H: FloatArray) -> None:
+        """Take away the readings of nodes that are down."""
         setup, times = self.setup, self._step_times(y.shape[1])
         for r, tables in enumerate(self._tables):
             down = absent(setup, tables.lives, times)
@@ -690,11 +691,9 @@ class SlotRuns:
                 if sensor.linear:
                     there = np.isfinite(values)
                     matrix = matrix_of(sensor, anchor, setup.n)
-                    z = (
-                        values
-                        if believed is None
-                        else values - matrix @ believed.states(np.array([self._slot + k]))[0]
-                    )
+                    z = values
+                    if believed is not None:
+                        z = values - matrix @ believed.states(np.array([self._slot + k]))[0]
                     both = np.column_stack([z, matrix])[there]
                     white = solve_lower(cholesky(R[there][:, there]), both)
                     y[:, k, h, first : first + p], H[:, k, h, first : first + p] = 0.0, 0.0
@@ -702,7 +701,7 @@ class SlotRuns:
                     y[:, k, h, rows] = white[:, :1]
                     H[:, k, h, rows] = setup.columns.of(h, white[:, 1:], place)[..., None]
                 elif place is None:
-                    self._write_nonlinear((s, sensor), (k, m), (values, anchor, R), y, H)
+                    self._write_nonlinear(s, k, first, (values, anchor, R), y, H)
                 else:
                     y[:, k, h, first : first + p] = values[:, None]
                     pairs.rows.R[k, pair, :p, :p] = R
@@ -711,26 +710,26 @@ class SlotRuns:
         self, s: AssignedSensor, path: Any, sensed: np.ndarray, y: FloatArray, H: FloatArray
     ) -> None:
         """Write recorded values of a nonlinear sensor, their origins, and covariances."""
-        sensor: Any = self._scenario.located_sensors[s.placed_sensor.entry]
         y[:, sensed, s.estimator, s.row : s.row + s.rows] = np.nan
         for k in np.flatnonzero(sensed).tolist():
             for m, reading in enumerate(path.readings_at(self._slot + k, s.R)):
-                self._write_nonlinear((s, sensor), (k, m), reading, y, H)
+                self._write_nonlinear(s, k, s.row + m * len(s.R), reading, y, H)
 
     def _write_nonlinear(
         self,
-        of: tuple[AssignedSensor, Any],
-        which: tuple[int, int],
+        s: AssignedSensor,
+        k: int,
+        first: int,
         reading: tuple[FloatArray, int, FloatArray],
         y: FloatArray,
         H: FloatArray,
     ) -> None:
-        """Write reading m of slot k, ``which`` = (k, m), of a recorded nonlinear sensor."""
-        (s, sensor), (k, m), (values, anchor, R) = of, which, reading
-        setup, nonlinear, p = self.setup.nonlinear, self._nonlinear, len(s.R)
+        """Write a ``reading`` of slot k, values, anchor and R, into the rows from ``first`` on."""
+        (values, anchor, R), setup, nonlinear = reading, self.setup.nonlinear, self._nonlinear
         assert nonlinear is not None
         assert setup is not None
-        rows = slice(s.row + m * p, s.row + (m + 1) * p)
+        sensor: Any = self._scenario.located_sensors[s.placed_sensor.entry]
+        rows = slice(first, first + len(s.R))
         place = setup.reference(sensor, s.node if anchor < 0 else anchor, s.estimator)
         y[:, k, s.estimator, rows] = values[:, None]
         H[:, k, s.estimator, rows, : len(place)] = place[:, None]

@@ -173,7 +173,8 @@ def timed_observations(
                         H = path.reading(k, np.zeros(n))[1]
                         reading = Observation(H, *_noise(path, k, noises[placed.entry]))
                     at_time = observations.setdefault(time, {}).setdefault(estimator, [])
-                    at_time += [reading] * is_up(node, time)
+                    if is_up(node, time):
+                        at_time.append(reading)
     return {
         time: {estimator: join(readings, n) for estimator, readings in at_time.items()}
         for time, at_time in observations.items()
