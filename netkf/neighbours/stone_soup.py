@@ -87,7 +87,11 @@ def _detections(run: Run, start: datetime.datetime | None) -> set[Any]:
             # Readings are counted without the response to an input that filters know.
             y = y + one.H @ origin
         model = _model_class()(
-            ndim_state=scenario.plant.n, mapping=(), noise_covar=one.R, reading=one.H
+            ndim_state=scenario.plant.n,
+            mapping=(),
+            noise_covar=one.R,
+            reading=one.H,
+            origin=origin[:, None],
         )
         detections.add(
             detection(
@@ -107,10 +111,13 @@ def _model_class() -> Any:
     gaussian = _import("models.measurement.nonlinear").NonLinearGaussianMeasurement
 
     class Reading(gaussian):  # type: ignore[misc,valid-type]
-        """``y = H x + v`` or ``y = h(x) + v``; ``reading`` is H (p, n) or a Linearised."""
+        """``y = H x + v`` or ``y = h(x - origin) + v``; ``reading`` is H (p, n) or a Linearised
+        of states without the known response ``origin`` (n, 1) to an input.
+        """
 
         # Not an annotation: Python 3.14 hides those of this module, whose evaluation is postponed.
         reading = base.Property(Any, doc="H, or h with its Jacobian")
+        origin = base.Property(Any, doc="what h takes off states")
 
         @property
         def ndim_meas(self) -> int:
@@ -120,7 +127,7 @@ def _model_class() -> Any:
             xs = np.asarray(state.state_vector, dtype=np.float64)
             H = self.reading
             is_linear = isinstance(H, np.ndarray)
-            y = H @ xs if is_linear else np.column_stack([H.value(x) for x in xs.T])
+            y = H @ xs if is_linear else np.column_stack([H.value(x) for x in (xs - self.origin).T])
             drawn = self.rvs(num_samples=xs.shape[1]) if noise is True else noise
             cls = types.StateVector if y.shape[1] == 1 else types.StateVectors
             return cls(y) + (0 if drawn is False or drawn is None else drawn)
@@ -128,7 +135,7 @@ def _model_class() -> Any:
         def jacobian(self, state: Any, **_: Any) -> FloatArray:
             if isinstance(self.reading, np.ndarray):
                 return self.reading
-            x = np.asarray(state.state_vector, dtype=np.float64)[:, 0]
+            x = (np.asarray(state.state_vector, dtype=np.float64) - self.origin)[:, 0]
             jacobian: FloatArray = self.reading(self.reading.value(x), x)[1]
             return jacobian
 

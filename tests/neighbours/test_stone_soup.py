@@ -93,11 +93,16 @@ def test_the_tracker_of_a_node_gives_what_local_gives(slot_run):
 
 def test_nonlinear_detections_have_the_jacobian_of_their_sensor():
     path = SCENARIOS / "nonlinear" / "range_tracking.toml"
-    scenario = netkf.load(path, {"horizon": 4.0})
+    driven = {"kind": "constant", "G": [[1.0], [0.0], [0.0], [0.0]], "value": [3.0]}
+    scenario = netkf.load(path, {"horizon": 4.0, "plant.input": driven})
     run = netkf.simulate(scenario, engine="simpy")
     found = run.to_stonesoup()
     (truth,) = found.truths
     states = {state.timestamp: state for state in truth}
+    for d in found.detections:
+        if d.timestamp in states:
+            y = d.measurement_model.function(states[d.timestamp])
+            assert abs(float((d.state_vector - y)[0])) < 5.0 * scenario.sensors[0].R[0, 0] ** 0.5
     one = next(d for d in found.detections if d.timestamp in states)
     state = states[one.timestamp]
     x, model = state.state_vector[:, 0].astype(float), one.measurement_model
