@@ -91,7 +91,7 @@ class Payload:
         link: int = self.sender.run.links.get(receiver, last)
         return min(link, last)
 
-    def told_to(self, receiver: int) -> Payload:
+    def message_to(self, receiver: int) -> Payload:
         """Return the message for a ``receiver`` (id) alone."""
         k = self.number_to(receiver)
         return self.with_fields({name: rows[k : k + 1] for name, rows in self.fields.items()})

@@ -660,7 +660,7 @@ def absorb(record: Any, h: int, run: Any) -> None:
     """
     f, p, n, links = record.work, record.payload, len(run.size), (run.first[h], run.first[h + 1])
     for q in range(len(run.lanes)):
-        if not is_told(record, h, run, q):
+        if not mark_heard(record, h, run, q):
             continue
         trace, is_current = believe(record, h, n, links, -1, q), True
         keep_mean(f)
@@ -685,8 +685,8 @@ def absorb(record: Any, h: int, run: Any) -> None:
 
 
 @kernel
-def is_told(record: Any, h: int, run: Any, q: int) -> bool:
-    """Return True if messages arrived; a reading of ``h`` of this instant enters the window."""
+def mark_heard(record: Any, h: int, run: Any, q: int) -> bool:
+    """Make now an instant of the window if a message reads ``h`` now; return if any arrived."""
     found, p, now, links = False, record.payload, time_of(run), (run.first[h], run.first[h + 1])
     for k in range(run.count):
         m = run.message[k]

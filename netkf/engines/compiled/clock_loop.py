@@ -55,12 +55,12 @@ from netkf.engines.compiled.events import (
     next_reached,
     on_sense_or_deliver,
     participant,
-    passes_over,
     reached,
     record_event,
     record_event_with_age,
     record_links,
     seek_piece,
+    skip_if_down,
     stamped_age,
     store_sample,
 )
@@ -177,7 +177,7 @@ def clock_loop(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs)
         if request != GO_ON:
             return request
         seek_piece(state, now)
-        if passes_over(state, event):
+        if skip_if_down(state, event):
             continue
         predict_participants(state, record, run, verbs, event, now)
         if event == ON_TICK:

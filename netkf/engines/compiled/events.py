@@ -153,8 +153,8 @@ def participant(state: Simulation, event: int, k: int) -> int:
 
 
 @kernel
-def passes_over(state: Simulation, event: int) -> bool:
-    """Return True for a sample or tick of nodes that are down, and go on to the one after it."""
+def skip_if_down(state: Simulation, event: int) -> bool:
+    """Go on to the next sample or tick if the nodes of this one are down; return if they are."""
     if event not in (ON_SAMPLE, ON_TICK):
         return False
     for k in range(count_participants(state, event)):

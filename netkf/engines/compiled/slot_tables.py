@@ -224,7 +224,7 @@ class SlotTables:
             asked[:, setup.ends.ravel()] = 1
         if setup.quantise is not None:
             # The filters are asked before the messages are made, and need to know who speaks.
-            self._who_sends(times, uses)
+            self._find_senders(times, uses)
         return np.asarray(asked * ~self._down(times)[0])
 
     def following(self, times: StepTimes, decide: Decide | None = None) -> np.ndarray:
@@ -234,7 +234,7 @@ class SlotTables:
         """
         setup, uses = self._setup, self._uses or self._begin_block(times)
         up = np.zeros((len(times.start), len(setup.fresh), len(setup.directions)), dtype=np.uint8)
-        sends = self._who_sends(times, uses)
+        sends = self._find_senders(times, uses)
         if decide is None:
             messages = self._send(times, _chosen(uses, sends), up)
         else:
@@ -371,7 +371,7 @@ class SlotTables:
         down = self.lives.is_down(np.arange(len(self._ids)), times.begin[..., None])
         return np.asarray(down & times.exchanged[:, None, None])
 
-    def _who_sends(self, times: StepTimes, uses: Uses) -> np.ndarray:
+    def _find_senders(self, times: StepTimes, uses: Uses) -> np.ndarray:
         """Return which of the uses (D,) carry a message, unless nodes decide to be silent."""
         setup, sender = self._setup, self._sender[uses.w]
         sends = uses.near & (setup.talks[uses.step, uses.w] == 1)

@@ -89,7 +89,7 @@ class KernelColumns:
     ) -> ColumnState:
         """Return the state after all messages of this instant."""
         receiver = state.inner.run.info.node
-        told = [_told_to(receiver, message.payload) for message in messages]
+        told = [_message_to(receiver, message.payload) for message in messages]
         inputs = [y for one in (state, *told) for y in one.inputs]
 
         def absorbed(*values: FloatArray) -> Any:
@@ -154,9 +154,9 @@ def _given(state: ColumnState, values: Iterator[FloatArray]) -> Any:
     return inner
 
 
-def _told_to(receiver: int, told: ColumnState) -> ColumnState:
+def _message_to(receiver: int, told: ColumnState) -> ColumnState:
     """Return a payload of several messages without those that are for others."""
-    inner = told.inner.told_to(receiver)
+    inner = told.inner.message_to(receiver)
     count = len(next(iter(told.inner.fields.values())))
     k = told.inner.number_to(receiver)
     means = {name: x.reshape(count, -1, x.shape[1])[k] for name, x in told.means.items()}
