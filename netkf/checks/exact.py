@@ -48,7 +48,7 @@ from netkf.laws.intervals import (
     student_interval,
 )
 from netkf.laws.noise import MIN_VARIANCE_SHARE, whiten
-from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.linalg.arrays import FloatArray, IntArray, in_units, row_units
 from netkf.scenario.records import nodes_with_law
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.increments import integration_steps
@@ -140,7 +140,8 @@ def _exact_statistics(
     # Errors less their exact mean are normal with mean 0.
     centred = run.error[:, :M] - mean
     floor = np.maximum((BLUR * run.rounding) ** 2, _variance_floor(scenario))
-    joint, bias = _pool_times(centred, law.covariance, float(floor.max()))
+    units = row_units(np.diagonal(stacked, axis1=1, axis2=2)).reshape(-1)
+    joint, bias = _pool_times(centred, law.covariance, units, float(floor.max()))
     pooled = {
         "whole": whiten_errors(centred[at], stacked[at], floor[at]),
         "joint": joint,
@@ -161,14 +162,15 @@ def max_replayed(scenario: Scenario) -> int:
     return max(MIN_REPLAYED, min(MAX_REPLAYED, needed, affordable))
 
 
-def _pool_times(e: FloatArray, Sigma: FloatArray, floor: float) -> tuple[FloatArray, FloatArray]:
-    size, n = e[0].size, e.shape[-1]
-    # Variances may differ by orders of magnitude between times: each time is scaled to size 1.
-    scale = np.repeat(np.sqrt(np.diagonal(Sigma).reshape(-1, size).max(axis=1)), size)
-    scale = np.where(scale > 0.0, scale, 1.0)
-    values, vectors = np.linalg.eigh(Sigma / np.outer(scale, scale))
-    varying = (values > MIN_VARIANCE * values[-1]) & (values > floor / scale.min() ** 2)
-    whitening = (vectors / np.sqrt(np.where(varying, values, np.inf))).T / scale
+def _pool_times(
+    e: FloatArray, Sigma: FloatArray, units: FloatArray, floor: float
+) -> tuple[FloatArray, FloatArray]:
+    n = e.shape[-1]
+    # Variances may differ by orders of magnitude between times and states.
+    values, vectors = np.linalg.eigh(in_units(Sigma, units))
+    rounding = floor * np.square(vectors / units[:, None]).sum(axis=0)
+    varying = (values > MIN_VARIANCE * values[-1]) & (values > rounding)
+    whitening = (vectors / np.sqrt(np.where(varying, values, np.inf))).T / units
     z = whitening @ e.reshape(-1)
     # A constant bias b shifts all errors by X b, X the stacked identities (K M n, n). The design
     # matrix of z is whitening X: D' D is the information and D' z the information vector of b.
@@ -199,7 +201,9 @@ def _pool_nees(e: FloatArray, P: FloatArray, law: ErrorLaw) -> FloatArray:
 def _nearly_singular(P: FloatArray) -> np.ndarray:
     """Return a mask (K, N) of covariances P (K, N, n, n) that are singular or not finite."""
     finite = np.asarray(np.isfinite(P).all(axis=(-1, -2)))
-    values = np.linalg.eigvalsh(np.where(finite[..., None, None], P, 0.0))
+    P = np.where(finite[..., None, None], P, 0.0)
+    units = row_units(np.diagonal(P, axis1=-2, axis2=-1))
+    values = np.linalg.eigvalsh(in_units(P, units))
     return np.asarray(~(values[..., 0] > SINGULAR * values[..., -1]))
 
 
@@ -224,12 +228,16 @@ def few_errors(scenario: Scenario) -> Assumption:
 def whiten_errors(e: FloatArray, stacked: FloatArray, floor: FloatArray | float) -> FloatArray:
     """Return ``e' Sigma^-1 e`` and its degrees of freedom, (K, 2), of errors less their mean ``e``
     (K, N, n) with joint covariances ``stacked`` (K, N n, N n). Directions count if their variance
-    is above MIN_VARIANCE times the largest one and above ``floor`` (K,).
+    is above MIN_VARIANCE times the largest one, in units of the rows, and above that of
+    rounding, ``floor`` (K,) in each row.
     """
     finite = np.asarray(np.isfinite(stacked).all(axis=(-1, -2)))
-    values, vectors = np.linalg.eigh(np.where(finite[:, None, None], stacked, 0.0))
-    counted = (values > MIN_VARIANCE * values[:, -1:]) & (values > np.reshape(floor, (-1, 1)))
-    components = np.einsum("kab,ka->kb", vectors, e.reshape(len(e), -1))
+    stacked = np.where(finite[:, None, None], stacked, 0.0)
+    units = row_units(np.diagonal(stacked, axis1=1, axis2=2))
+    values, vectors = np.linalg.eigh(in_units(stacked, units))
+    rounding = np.reshape(floor, (-1, 1)) * np.square(vectors / units[..., None]).sum(axis=1)
+    counted = (values > MIN_VARIANCE * values[:, -1:]) & (values > rounding)
+    components = np.einsum("kab,ka->kb", vectors, e.reshape(len(e), -1) / units)
     square = np.where(counted, components**2 / np.where(counted, values, 1.0), 0.0).sum(axis=1)
     return np.stack([square, counted.sum(axis=1)], axis=1)
 
@@ -299,9 +307,13 @@ def _compare_with_exact(
     known = np.isfinite(Sigma).all(axis=(-1, -2))
     if not known.any():
         return find_unknown("no exact covariance could be computed")
+    P, Sigma = samples.in_units(P), samples.in_units(Sigma)
     size = np.where(known, np.trace(Sigma, axis1=-2, axis2=-1), 0.0)
     limits = size, samples.largest_terms(samples.runs.replayed[:max_runs]), EXACT_TOLERANCE
-    message = f"{name} of P - Sigma relative to trace(Sigma) in {known.sum():,} covariances"
+    message = (
+        f"{name} of P - Sigma relative to trace(Sigma), in units of the states, in "
+        f"{known.sum():,} covariances"
+    )
     return compare_points(samples, measure(P - Sigma) * known, limits, message)
 
 
@@ -396,7 +408,9 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
     # Points without exact covariances have no weight, and so are not tested.
     known = np.isfinite(P + Sigma).all(axis=(-1, -2), keepdims=True)
     P, Sigma = np.where(known, P, 0.0), np.where(known, Sigma, 0.0)
-    inverse, m = np.linalg.pinv(P), runs.mean[:max_runs]  # m is the exact mean of the errors
+    units = row_units(np.diagonal(P, axis1=-2, axis2=-1))
+    inverse = in_units(np.asarray(np.linalg.pinv(in_units(P, units))), units)
+    m = runs.mean[:max_runs]  # the exact mean of the errors
     weights = np.linalg.eigvals(inverse @ Sigma).real
     weights = np.maximum(weights, 0.0).reshape(len(P), -1, n)
     mean = weights.sum(axis=(0, 2))

@@ -15,19 +15,18 @@ from netkf.checks.laws import (
     FIXED_READINGS,
     LAW_TOLERANCE,
     Pair,
-    compare_laws,
     diagonal_distances,
     find_largest,
     fixed_readings,
 )
 from netkf.checks.mode_sequences import (
-    FAR_START,
     MIN_CHAINS,
     Reference,
     SwitchedReference,
     check_bounded,
     check_law,
     check_start,
+    far_roots,
     gossip_modes,
     initial_roots,
     pair_sources,
@@ -47,7 +46,7 @@ from netkf.checks.samples import (
 from netkf.checks.statistics import band_around, band_width, round_digits
 from netkf.core.errors import TheoryError
 from netkf.laws.intervals import deviation_interval, probability_interval
-from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.linalg.arrays import FloatArray, IntArray, row_units
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.theory.gossip.matchings import effective_matching
@@ -58,7 +57,7 @@ WINDOW = 40
 covariance is computed.
 """
 UNKNOWN = 1e9
-"""Standard deviation of each state that stands for an unknown state."""
+"""Deviation that stands for an unknown state, in units of the largest one of its estimates."""
 MIN_TOKENS = 100
 """Number of chains that start at one node below which their law is not compared."""
 BOUND_TOLERANCE = 1e-8  # of P, relative: rounding of a long product
@@ -83,7 +82,9 @@ def _summarise(scenario: Scenario, run: Run) -> ReplicaSummary:
         return summary
     table = gossip_modes(scenario)
     # Square roots of P(0), (N', n, n) for all N' nodes.
-    starts, n, sampled = initial_roots(scenario), scenario.plant.n, sampled_indices(scenario)
+    starts, sampled = initial_roots(scenario), sampled_indices(scenario)
+    variances = np.nan_to_num(np.diagonal(run.P, axis1=-2, axis2=-1), posinf=0.0).max(axis=(0, 1))
+    units = row_units(np.maximum(variances, np.square(starts).sum(axis=-1).max(axis=0)))
     replayed, bounds = [], []
     for slot in slots:
         # Where the pairs that the nodes hold now started, and the nodes that they were at since.
@@ -92,7 +93,7 @@ def _summarise(scenario: Scenario, run: Run) -> ReplicaSummary:
         replayed.append(table.covariances(starts[origin], path, [slot])[0])
         # The bound: the same recursion over the last readings only, from an unknown state on.
         recent = path[:, -WINDOW:]
-        unknown = np.repeat(UNKNOWN * np.eye(n)[None], len(recent), axis=0)
+        unknown = np.repeat(UNKNOWN * np.diag(units)[None], len(recent), axis=0)
         bounds.append(table.covariances(unknown, recent, [recent.shape[1]])[0])
     # The node that holds each token at the end; any node if pairs were copied, since then the
     # replay differs from P and the covariances of tokens mean nothing.
@@ -150,9 +151,7 @@ class GossipSamples(SwitchedReference):
         starts, random = initial_roots(self.scenario), Streams(self.seed).generator(purpose)
         positions = _draw_chains(self.matching, slots[-1], count, random)
         table, start_roots = gossip_modes(self.scenario), starts[positions[:, 0]]
-        # The identity makes the second start larger even where P(0) = 0.
-        larger_roots = FAR_START * start_roots + np.eye(start_roots.shape[-1])
-        restarted = table.covariances(larger_roots, positions, slots[-1:])[0]
+        restarted = table.covariances(far_roots(start_roots), positions, slots[-1:])[0]
         P = table.covariances(start_roots, positions, slots)
         last = positions[:, np.array(slots) - 1].T
         return Reference(P[None], restarted[None], at_node=last, first=positions[:, 0])
@@ -175,7 +174,7 @@ def _draw_chains(
 
 def _walks_bound(samples: GossipSamples, level: float) -> Finding:
     """Check that no P of the runs (R, K, N, n, n) exceeds its bound, paper G Lemma 14."""
-    P, bound = samples.runs.P, samples.runs.bounds
+    P, bound = samples.in_units(samples.runs.P), samples.in_units(samples.runs.bounds)
     size = np.trace(bound, axis1=-2, axis2=-1)
     # A covariance that is not finite exceeds every bound.
     with np.errstate(invalid="ignore"):
@@ -184,13 +183,14 @@ def _walks_bound(samples: GossipSamples, level: float) -> Finding:
     shortfall = np.full(finite.shape, np.inf)
     shortfall[finite] = np.maximum(-np.linalg.eigvalsh(gap[finite])[..., 0], 0.0)
     detected = size < UNKNOWN  # far below UNKNOWN^2, the variance of an unknown state
-    largest = f"{size[detected].max():.4g}" if detected.any() else "none"
+    traces = np.trace(samples.runs.bounds, axis1=-2, axis2=-1)
+    largest = f"{traces[detected].max():.4g}" if detected.any() else "none"
     message = (
         f"in {detected.mean():.0%} of all cases the last {WINDOW} readings detect the state; "
         f"largest trace of the bounds that they give: {largest}"
     )
     # The root of the bound is computed from one of size UNKNOWN, whose rounding errors it inherits.
-    terms = np.maximum(UNKNOWN * np.sqrt(size), samples.largest_terms(P))
+    terms = np.maximum(UNKNOWN * np.sqrt(size), samples.largest_terms(samples.runs.P))
     # Size of the values, of the terms whose rounding errors they inherit, and relative tolerance.
     limits = size, terms, BOUND_TOLERANCE
     return compare_points(samples, shortfall, limits, message)
@@ -218,7 +218,7 @@ def _random_sensor(samples: GossipSamples, level: float) -> Finding:
         Pair(f"slot {slot}", samples.runs.P[runs, k, picks[k]], samples.reference.P[0, k])
         for k, slot in enumerate(check_slots(samples.scenario))
     ]
-    return compare_laws(pairs, level, samples.first_trace)
+    return samples.compare_laws(pairs, level)
 
 
 def _sensors_together(samples: GossipSamples, level: float) -> Finding:
@@ -262,7 +262,7 @@ def _check_tokens(samples: GossipSamples, level: float) -> Finding:
     chain, origin = samples.reference.P[0, last], samples.reference.first
     for i, node in enumerate(samples.nodes):
         pairs.append(Pair(f"token {node}", samples.runs.tokens[:, i], chain, chain[origin == i]))
-    return samples.with_horizon(compare_laws(pairs, level, samples.first_trace), _token_memory)
+    return samples.with_horizon(samples.compare_laws(pairs, level), _token_memory)
 
 
 # What promises need: parts of names or sources in the table of assumptions, see ``Promise.needs``.

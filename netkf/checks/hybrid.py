@@ -27,7 +27,7 @@ from netkf.checks.samples import RunSamples, check_replay, check_times, sampled_
 from netkf.checks.statistics import affine, eigenvalue_interval
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.laws.intervals import Interval
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, in_units, row_units
 from netkf.network.clocks import Poisson, Renewal
 from netkf.scenario.scenario import Scenario
 from netkf.theory import (
@@ -115,10 +115,11 @@ def _mean_below_bound(samples: HybridSamples, level: float) -> Finding:
 
 def _relative_excess(P: FloatArray, bound: FloatArray, level: float) -> Interval | None:
     """Return an interval for the largest eigenvalue of E[P] relative to ``bound``, less 1."""
-    values, vectors = np.linalg.eigh(bound)
+    units = row_units(np.diagonal(bound))
+    values, vectors = np.linalg.eigh(in_units(bound, units))
     if not values[0] > 1e-12 * values[-1]:
         return None
-    white = vectors / np.sqrt(values)
+    white = vectors / np.sqrt(values) / units[:, None]
     ratio = eigenvalue_interval(white.T @ P @ white, level)
     # An event of probability up to log(1 / level) / R may have occurred in no run. It could bring P
     # down to 0, so that the lower limit of E[P] is reduced by this share.
@@ -136,7 +137,9 @@ def _bound_settles(samples: HybridSamples, level: float) -> Finding:
     while distance > STEADY_TOLERANCE and factor < MAX_TIME:
         factor *= 10.0
         bound = covariance_bound(promised, np.array([factor * samples.scenario.horizon]))[0]
-        distance = float(np.abs(bound - steady_bound).max() / np.abs(steady_bound).max())
+        units = row_units(np.diagonal(steady_bound, axis1=1, axis2=2).max(axis=0))
+        gap, size = (in_units(np.abs(one), units) for one in (bound - steady_bound, steady_bound))
+        distance = float(gap.max() / size.max())
     message = (
         f"computed, not simulated: the bound at {factor:g} horizons differs from its steady state "
         f"by {distance:.1e} of the largest entry"
@@ -150,11 +153,11 @@ def _bound_approaches_limit(samples: HybridSamples, level: float) -> Finding:
     promised = with_promised_filter(samples.scenario)
     # Links so fast that the distance is already in its power law.
     S, first = limit_covariance(promised), _mixing_factor(promised)
-    distances = []
+    units, distances = row_units(np.diagonal(S)), []
     for factor in (first, 10.0 * first):
         bound = steady_covariance_bound(_with_faster_links(promised, factor))
-        distances.append(float(np.linalg.norm(bound - S, axis=(1, 2)).max()))
-    size = float(np.linalg.norm(S, axis=(-2, -1)).max())
+        distances.append(float(np.linalg.norm(in_units(bound - S, units), axis=(1, 2)).max()))
+    size = float(np.linalg.norm(in_units(S, units)))
     if distances[-1] <= DISTANCE_TOLERANCE * size:
         message = (
             f"computed, not simulated: with rates {first:.3g} and {10.0 * first:.3g} times larger "
@@ -177,6 +180,8 @@ def _constant_gains_are_worse(samples: HybridSamples, level: float) -> Finding:
     promised = with_promised_filter(samples.scenario)
     times = np.array(check_times(samples.scenario))
     time_varying, constant = covariance_bound(promised, times), constant_gain_bound(promised, times)
+    units = row_units(np.diagonal(time_varying, axis1=-2, axis2=-1).max(axis=(0, 1)))
+    time_varying, constant = in_units(time_varying, units), in_units(constant, units)
     size = np.trace(time_varying, axis1=-2, axis2=-1)
     smallest = np.linalg.eigvalsh(constant - time_varying)[..., 0] / np.maximum(size, 1e-300)
     trace_excess = np.trace(constant, axis1=-2, axis2=-1) / np.maximum(size, 1e-300) - 1.0
@@ -190,9 +195,11 @@ def _constant_gains_are_worse(samples: HybridSamples, level: float) -> Finding:
 def _mixing_factor(scenario: Scenario) -> float:
     S, slowest = limit_covariance(scenario), _slowest_mixing(coupling(scenario))
     models = {id(model): model for model in scenario.models}.values()  # nodes share them
+    units = row_units(np.diagonal(S))
+    size = np.linalg.norm(in_units(S, units), 2)
     speeds = [
-        np.linalg.norm(m.A, 2)
-        + np.linalg.norm(S, 2) * np.linalg.norm(m.H.T @ np.linalg.solve(m.R, m.H), 2)
+        np.linalg.norm(m.A * units / units[:, None], 2)
+        + size * np.linalg.norm(units[:, None] * m.H.T @ np.linalg.solve(m.R, m.H * units), 2)
         for m in models
     ]
     return max(1.0, 100.0 * float(max(speeds)) / slowest)

@@ -24,6 +24,7 @@ from netkf.checks.mode_sequences import (
     check_bounded,
     check_law,
     check_start,
+    far_roots,
     find_arrivals,
     initial_roots,
     intermittent_modes,
@@ -36,13 +37,14 @@ from netkf.checks.samples import (
     check_replay,
     check_slots,
     compare_points,
+    first_covariances,
     sampled_indices,
     sampled_nodes,
 )
 from netkf.checks.statistics import distance_to_law, law_distance, pearson_test
 from netkf.core.errors import TheoryError
 from netkf.laws.intervals import deviation_interval, probability_interval
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, row_units
 from netkf.linalg.spectra import contracts, growth_factor
 from netkf.network.matchings import Broadcast
 from netkf.rng.streams import Streams
@@ -95,7 +97,7 @@ def _summarise(scenario: Scenario, run: Run) -> ReplicaSummary:
     # Of N sampled nodes and the D directed links that can carry readings, with the same readings:
     # in_support (N, n, n) P from the start P*, the steady covariance of a node that gets all
     #                      readings: a point of the support of the invariant law, R Theorem 10
-    # spread (N,)          trace of the difference between P from a very large start and P from 0;
+    # spread (N, n, n)     the difference between P from a very large start and P from 0;
     #                      the recursion is monotone: any other start ends between these two
     # averages (N,)        averages of u / (u + tr P), u = tr Q, over the second half of the slots
     # sent, arrived (D,)   readings sent and delivered in time
@@ -105,7 +107,7 @@ def _summarise(scenario: Scenario, run: Run) -> ReplicaSummary:
     summary.arrived = _count_messages(scenario, run, "deliver", slots[-1])
     if not fixed_readings(scenario).holds:
         summary.in_support = np.full(summary.P[-1].shape, np.nan)
-        summary.spread = summary.averages = summary.in_support[:, 0, 0]
+        summary.spread, summary.averages = summary.in_support, summary.in_support[:, 0, 0]
         return summary
     table, sequences = find_arrivals(scenario, run, slots[-1])
     # Roots of the covariances at the start, (W, n, n) each.
@@ -116,7 +118,7 @@ def _summarise(scenario: Scenario, run: Run) -> ReplicaSummary:
     from_zero = table.covariances(np.zeros(starts.shape), sequences, last)[0]
     summary.replayed = table.covariances(starts, sequences, slots)
     summary.in_support = table.covariances(steady_roots, sequences, last)[0]
-    summary.spread = np.trace(from_above - from_zero, axis1=-2, axis2=-1)
+    summary.spread = from_above - from_zero
     summary.averages = _path_averages(table, starts, sequences)
     return summary
 
@@ -124,7 +126,8 @@ def _summarise(scenario: Scenario, run: Run) -> ReplicaSummary:
 def _roots_above(*roots: FloatArray) -> FloatArray:
     """Return roots (W, n, n) of a start covariance far above all of the given ones."""
     total = sum(root @ np.swapaxes(root, -1, -2) for root in roots)
-    above = FAR_START**2 * total + np.eye(roots[0].shape[-1])
+    units = row_units(np.diagonal(total, axis1=-2, axis2=-1))
+    above = FAR_START**2 * total + np.eye(units.shape[-1]) * np.square(units)[..., None]
     return np.asarray(np.linalg.cholesky(above), dtype=np.float64)
 
 
@@ -191,8 +194,7 @@ class IntermittentSamples(SwitchedReference):
         ]
         table, sequences = intermittent_modes(scenario, sets), sequences.reshape(codes.shape)
         start_roots = np.repeat(initial_roots(scenario)[k : k + 1], samples, axis=0)
-        larger_roots = FAR_START * start_roots + np.eye(start_roots.shape[-1])
-        restarted = table.covariances(larger_roots, sequences, slots[-1:])[0]
+        restarted = table.covariances(far_roots(start_roots), sequences, slots[-1:])[0]
         averages = _path_averages(table, start_roots[:paths], sequences[:paths])
         return table.covariances(start_roots, sequences, slots), restarted, averages
 
@@ -208,11 +210,10 @@ def _above_least(samples: IntermittentSamples, level: float) -> Finding:
     table, sequences = find_arrivals(samples.scenario, None, slots[-1])
     starts = initial_roots(samples.scenario)[sampled_indices(samples.scenario)]
     without_loss = table.covariances(starts, sequences, slots)
-    size = np.trace(samples.runs.P, axis1=-2, axis2=-1)
+    P, least = samples.in_units(samples.runs.P), samples.in_units(without_loss)
+    size = np.trace(P, axis1=-2, axis2=-1)
     with np.errstate(invalid="ignore"):
-        gap = np.linalg.eigvalsh(
-            np.nan_to_num(samples.runs.P - without_loss, nan=-np.inf, posinf=-1e300)
-        )
+        gap = np.linalg.eigvalsh(np.nan_to_num(P - least, nan=-np.inf, posinf=-1e300))
     shortfall = np.maximum(-gap[..., 0], 0.0)
     message = f"{size.size:,} covariances against the path without losses"
     # Size of the values, of the terms whose rounding errors they inherit, and relative tolerance.
@@ -222,7 +223,11 @@ def _above_least(samples: IntermittentSamples, level: float) -> Finding:
 
 def _in_support(samples: IntermittentSamples, level: float) -> Finding:
     """Compare P at the end with the point of its support that the readings lead to."""
-    P, point, spread = samples.runs.P[:, -1], samples.runs.in_support, samples.runs.spread
+    P, point, spread = (
+        samples.in_units(part)
+        for part in (samples.runs.P[:, -1], samples.runs.in_support, samples.runs.spread)
+    )
+    spread = np.trace(spread, axis1=-2, axis2=-1)
     finite = np.isfinite(point).all(axis=(0, -1, -2))  # nodes for which P* exists
     size = np.trace(point, axis1=-2, axis2=-1)[:, finite]
     converged = spread[:, finite] < SUPPORT_TOLERANCE * size
@@ -234,7 +239,8 @@ def _in_support(samples: IntermittentSamples, level: float) -> Finding:
     steady_roots = np.nan_to_num(_least_roots(samples.scenario))
     starts = initial_roots(samples.scenario)[sampled_indices(samples.scenario)]
     # Rounding errors are those of the very large start: its trace is the square sum of its root.
-    terms = np.sum(_roots_above(starts, steady_roots)[finite] ** 2, axis=(-2, -1))
+    above = _roots_above(starts, steady_roots)
+    terms = np.trace(samples.in_units(above @ np.swapaxes(above, 1, 2)), axis1=1, axis2=2)[finite]
     # Size of the values, of the terms whose rounding errors they inherit, and relative tolerance.
     limits = size, terms, SUPPORT_TOLERANCE
     finding = compare_identities(gap, *limits, message)
@@ -361,7 +367,7 @@ def _law_at_end(
     samples: IntermittentSamples, k: int, law: ScalarLaw
 ) -> Callable[[FloatArray], FloatArray]:
     node = int(sampled_indices(samples.scenario)[k])
-    start = float(samples.first_covariances[node, 0, 0])
+    start = float(first_covariances(samples.scenario)[node, 0, 0])
     return partial(law.cdf_after, slots=check_slots(samples.scenario)[-1], start=start)
 
 

@@ -109,7 +109,7 @@ def pool(
     )  # fmt: skip
 
 
-def compare_laws(pairs: Sequence[Pair], level: float, start: float = 0.0) -> Finding:
+def compare_laws(pairs: Sequence[Pair], level: float, start: float) -> Finding:
     """Test that samples of each pair have one law within LAW_TOLERANCE: Kolmogorov-Smirnov by
     diagonal entry; ``early`` before a limit is reached. P keeps roundings of ``start``, its trace.
     """

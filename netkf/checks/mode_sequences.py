@@ -22,12 +22,11 @@ from netkf.checks.laws import (
     LAW_TOLERANCE,
     Pair,
     compare_growth,
-    compare_laws,
     diagonal_distances,
     growth_intervals,
 )
 from netkf.checks.samples import MAX_NODES, RunSamples, check_slots, sampled_nodes
-from netkf.linalg.arrays import FloatArray, block_diagonal, square_root
+from netkf.linalg.arrays import FloatArray, block_diagonal, row_units, square_root
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
 from netkf.trace.schema import rows_of
@@ -155,7 +154,7 @@ def check_law(samples: SwitchedReference, level: float) -> Finding:
         for k, slot in enumerate(check_slots(samples.scenario))
         for i, node in enumerate(samples.nodes)
     ]
-    return compare_laws(pairs, level, samples.first_trace)
+    return samples.compare_laws(pairs, level)
 
 
 def check_bounded(samples: SwitchedReference, level: float) -> Finding:
@@ -180,7 +179,7 @@ def check_start(samples: SwitchedReference, level: float) -> Finding:
         )
         for i, node in enumerate(samples.nodes)
     ]
-    finding = compare_laws(pairs, level, samples.first_trace)
+    finding = samples.compare_laws(pairs, level)
     return samples.with_horizon(finding, lambda reference: reference.memory())
 
 
@@ -188,6 +187,12 @@ def growth_of(earlier: FloatArray, later: FloatArray) -> float:
     """Return the largest growth of an entry between two samples of covariances (S, n, n)."""
     # Only the value of each interval is used, for which the level does not matter.
     return max(interval.value for interval in growth_intervals(earlier, later, level=0.5))
+
+
+def far_roots(roots: FloatArray) -> FloatArray:
+    """Return roots (..., n, n) of starts far larger than ``roots``, even where P(0) = 0."""
+    units = row_units(np.square(roots).sum(axis=-1))
+    return np.asarray(FAR_START * roots + np.eye(units.shape[-1]) * units[..., None])
 
 
 def slots_until(distance: Callable[[int], float], slots: int, n: int, tolerance: float) -> float:

@@ -40,7 +40,7 @@ from netkf.checks.samples import (
 from netkf.checks.statistics import affine, quadratic_interval
 from netkf.core.errors import TheoryError
 from netkf.laws.intervals import Interval, deviation_interval
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, in_units, row_units
 from netkf.scenario.scenario import Scenario
 from netkf.theory import (
     exact_minimum_gamma,
@@ -78,18 +78,22 @@ class PushSumSamples(RunSamples):
     def standardised(self) -> FloatArray:
         """Errors (R', N, n) at the end, whitened by their exact covariance."""
         Sigma, e = self.runs.Sigma[self.followed, -1], self.runs.e[self.followed, -1]
-        values, vectors = np.linalg.eigh(Sigma)
+        units = row_units(np.diagonal(Sigma, axis1=-2, axis2=-1))
+        values, vectors = np.linalg.eigh(in_units(Sigma, units))
         # Smaller variances are rounding: they are raised, so that they do not blow up a component.
         floor = MIN_VARIANCE * values[..., -1:]
-        components = np.einsum("rnab,rna->rnb", vectors, e)
+        components = np.einsum("rnab,rna->rnb", vectors, e / units)
         return np.asarray(components / np.sqrt(np.maximum(values, floor)))
 
     @cached_property
     def steady_root(self) -> FloatArray:
         """W (N, n, n) with W S W' = I, S the exact steady covariance of sampled nodes."""
         Sigma = push_sum_error_covariance(with_promised_filter(self.scenario))
-        values, vectors = np.linalg.eigh(Sigma[sampled_indices(self.scenario)])
-        return np.swapaxes(vectors / np.sqrt(values)[:, None, :], 1, 2)
+        Sigma = Sigma[sampled_indices(self.scenario)]
+        units = row_units(np.diagonal(Sigma, axis1=-2, axis2=-1))
+        values, vectors = np.linalg.eigh(in_units(Sigma, units))
+        white = vectors / units[:, :, None] / np.sqrt(values)[:, None, :]
+        return np.asarray(np.swapaxes(white, 1, 2))
 
     @cached_property
     def ratios(self) -> tuple[FloatArray, FloatArray]:
@@ -108,9 +112,7 @@ def _at_steady_state(samples: PushSumSamples, level: float) -> Finding:
     P, replayed = samples.runs.P[was_replayed, -1], samples.runs.replayed[was_replayed, -1]
     if not len(P):
         return find_unknown("no run could be replayed")
-    distance, replayed_distance = (
-        float(relative_difference(covariances, limit).max()) for covariances in (P, replayed)
-    )
+    distance, replayed_distance = (_distance(samples, part, limit) for part in (P, replayed))
     # A distance that the equations themselves have at this time breaks no promise about the limit.
     early = distance > STEADY_TOLERANCE and distance <= replayed_distance + REPLAY_TOLERANCE
     margin = STEADY_TOLERANCE - distance
@@ -119,10 +121,15 @@ def _at_steady_state(samples: PushSumSamples, level: float) -> Finding:
     return Finding((margin, margin, margin), 0.0, message, early=early, horizon=horizon)
 
 
+def _distance(samples: PushSumSamples, P: FloatArray, limit: FloatArray) -> float:
+    """Return the largest distance of covariances P (R, N, n, n) from their ``limit`` (n, n)."""
+    return float(relative_difference(samples.in_units(P), samples.in_units(limit)).max())
+
+
 def _horizon_factor(samples: PushSumSamples, limit: FloatArray) -> float:
     """Return the factor on the horizon at which P is near its ``limit`` (n, n)."""
     P = samples.runs.replayed[~np.isnan(samples.runs.replayed[:, -1, 0, 0, 0])]
-    half, last = (float(relative_difference(P[:, k], limit).max()) for k in (-2, -1))
+    half, last = (_distance(samples, P[:, k], limit) for k in (-2, -1))
     if not 0.0 < last < half < math.inf:
         return math.nan
     # The distance falls by half / last in half the horizon; 20 % more for a decay that slows down.

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,8 +18,8 @@ from netkf.checks.evidence import (
     find_unknown,
     largest_terms,
 )
-from netkf.checks.laws import Pair, compare_growth
-from netkf.linalg.arrays import ArrayLike, FloatArray, IntArray
+from netkf.checks.laws import Pair, compare_growth, compare_laws
+from netkf.linalg.arrays import ArrayLike, FloatArray, IntArray, in_units, row_units
 from netkf.scenario.records import nodes_with_law
 from netkf.scenario.scenario import Scenario
 
@@ -115,6 +116,56 @@ def all_sampled(scenario: Scenario) -> Assumption:
     return Assumption("every node is watched", "netkf", not note, evidence)
 
 
+class CovarianceUnits(NamedTuple):
+    """Units in which the largest variance of each state is 1, so that a covariance that is wrong in
+    a small state is not lost beside a large one.
+
+    of_states : (n,), of the states of the plant
+    of_nodes  : (N, n'), of the states that each node of the network estimates, 1 beyond these
+    """
+
+    of_states: FloatArray
+    of_nodes: FloatArray
+
+
+def covariance_units(scenario: Scenario, nodes: IntArray, P: FloatArray) -> CovarianceUnits:
+    """Return the units of states whose covariances at ``nodes`` (W,) were P (..., W, n', n')."""
+    variances = np.diagonal(P, axis1=-2, axis2=-1)
+    variances = np.where(np.isfinite(variances), variances, 0.0)
+    variances = variances.reshape(-1, *variances.shape[-2:]).max(axis=0, initial=0.0)
+    largest, of_nodes = np.zeros(scenario.plant.n), np.ones((len(scenario.nodes), scenario.width))
+    for k, row in zip(nodes.tolist(), variances, strict=True):
+        own = largest[scenario.view(k)]
+        largest[scenario.view(k)] = np.maximum(own, row[: len(own)])
+    of_states = row_units(largest)
+    for k in range(len(of_nodes)):
+        own = of_states[scenario.view(k)]
+        of_nodes[k, : len(own)] = own
+    return CovarianceUnits(of_states, of_nodes)
+
+
+def first_covariances(scenario: Scenario) -> FloatArray:
+    """Return P(0) (N, n, n) of all nodes of the network, in their order; 0 beyond their states."""
+    P = np.zeros((len(scenario.nodes), scenario.width, scenario.width))
+    for k, node in enumerate(scenario.nodes):
+        cov = scenario.initial_estimate(node)[1]
+        pooled, n = scenario.node_filter.timing.pooled, scenario.sizes[k]
+        view = scenario.view(k) if pooled else slice(n)
+        P[k, :n, :n] = cov[view][:, view]
+    return P
+
+
+def rounded_terms(scenario: Scenario, P: FloatArray, units: CovarianceUnits) -> FloatArray:
+    """Return the sizes (R, K, N), in ``units``, of terms whose roundings remain in ``P``, which is
+    in ``units`` too.
+    """
+    views = scenario.model_views
+    of_model = units.of_states if views is None else units.of_states[views[0]]
+    G = in_units(scenario.node_infos[0].information, 1.0 / of_model)
+    first = in_units(first_covariances(scenario), units.of_nodes)
+    return largest_terms(P, first, float(np.linalg.norm(G, 2)))
+
+
 REPLAY_TOLERANCE = 1e-7  # of P, relative: two ways to compute it differ by roundings only
 
 
@@ -161,26 +212,37 @@ class RunSamples:
         """Ids of the N sampled nodes."""
         return sampled_nodes(self.scenario)
 
-    @property
-    def first_covariances(self) -> FloatArray:
-        """P(0) (N', n, n) of all N' nodes of the network, in their order; 0 beyond their states."""
-        P = np.zeros((len(self.scenario.nodes), self.scenario.width, self.scenario.width))
-        for k, node in enumerate(self.scenario.nodes):
-            cov = self.scenario.initial_estimate(node)[1]
-            pooled, n = self.scenario.node_filter.timing.pooled, self.scenario.sizes[k]
-            view = self.scenario.view(k) if pooled else slice(n)
-            P[k, :n, :n] = cov[view][:, view]
-        return P
+    @cached_property
+    def units(self) -> CovarianceUnits:
+        """The units in which covariances are compared."""
+        return covariance_units(self.scenario, sampled_indices(self.scenario), self.runs.P)
+
+    def in_units(self, P: FloatArray) -> FloatArray:
+        """Return covariances P (..., N, n, n) of the sampled nodes in ``units``."""
+        return in_units(P, self.units.of_nodes[sampled_indices(self.scenario)])
 
     @property
     def first_trace(self) -> float:
-        """The largest trace of P(0)."""
-        return float(np.trace(self.first_covariances, axis1=-2, axis2=-1).max())
+        """The largest trace of P(0), in ``units``."""
+        first = in_units(first_covariances(self.scenario), self.units.of_nodes)
+        return float(np.trace(first, axis1=-2, axis2=-1).max())
 
     def largest_terms(self, P: FloatArray) -> FloatArray:
-        """Return the sizes (R, K, N) of the terms whose roundings remain in ``P``."""
-        information = float(np.linalg.norm(self.scenario.node_infos[0].information, 2))
-        return largest_terms(P, self.first_covariances, information)
+        """Return the sizes (R, K, N), in ``units``, of terms whose roundings remain in ``P``."""
+        return rounded_terms(self.scenario, self.in_units(P), self.units)
+
+    def compare_laws(self, pairs: Sequence[Pair], level: float) -> Finding:
+        """Test in ``units`` that pairs of covariances of all states have one law each."""
+        units = self.units.of_states
+        scaled = [
+            pair._replace(
+                first=in_units(pair.first, units),
+                second=in_units(pair.second, units),
+                expected=None if pair.expected is None else in_units(pair.expected, units),
+            )
+            for pair in pairs
+        ]
+        return compare_laws(scaled, level, self.first_trace)
 
     @property
     def time_labels(self) -> list[str]:
@@ -209,7 +271,8 @@ def check_replay(samples: RunSamples, level: float) -> Finding:
     if not len(P):
         return find_unknown("no run could be replayed")
     unknown = ~np.isfinite(expected).all(axis=(-1, -2), keepdims=True)
-    P, expected = np.where(unknown, 0.0, P), np.where(unknown, 0.0, expected)
+    P, replay = np.where(unknown, 0.0, P), np.where(unknown, 0.0, expected)
+    P, expected = samples.in_units(P), samples.in_units(replay)
     with np.errstate(invalid="ignore"):
         gap = np.abs(P - expected).max(axis=(-1, -2))
     differences = relative_difference(P, expected).max(axis=(-1, -2))
@@ -219,7 +282,7 @@ def check_replay(samples: RunSamples, level: float) -> Finding:
         f"{gap.size:,} covariances replayed from the events of their runs; the worst in run "
         f"{np.flatnonzero(replayed)[run]} at {label}"
     )
-    limits = np.abs(expected).max(axis=(-1, -2)), samples.largest_terms(expected), REPLAY_TOLERANCE
+    limits = np.abs(expected).max(axis=(-1, -2)), samples.largest_terms(replay), REPLAY_TOLERANCE
     return compare_points(samples, gap, limits, message, replicas=np.flatnonzero(replayed))
 
 

@@ -22,6 +22,7 @@ from netkf.checks.exact import EXACT_TOLERANCE
 from netkf.checks.paper import PaperChecks
 from netkf.checks.samples import RunSamples, check_slots, sampled_indices
 from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import in_units
 from netkf.theory.track_fusion.steady_errors import tracks_in_slots
 
 START_FACTOR, STEADY_TOLERANCE = 10.0, 1e-3
@@ -40,9 +41,10 @@ def check_steady(samples: RunSamples, level: float) -> Finding:
     expected = steady[sampled_indices(samples.scenario)]
     # The effect of the start shrinks by the spectral radius in each slot.
     remaining = radius ** check_slots(samples.scenario)[-1]
-    gap = np.abs(samples.runs.P[:, -1] - expected).max(axis=(-1, -2))
-    size = np.trace(expected, axis1=-2, axis2=-1)
-    terms = samples.first_trace + float(np.trace(steady, axis1=-2, axis2=-1).max())
+    gap = samples.in_units(np.abs(samples.runs.P[:, -1] - expected)).max(axis=(-1, -2))
+    size = np.trace(samples.in_units(expected), axis1=-2, axis2=-1)
+    largest = np.trace(in_units(steady, samples.units.of_nodes), axis1=-2, axis2=-1).max()
+    terms = samples.first_trace + float(largest)
     allowed = EXACT_TOLERANCE + START_FACTOR * remaining * terms / float(size.min())
     message = f"P at the end of {samples.count} runs"
     finding = find_identity(float((gap / size).max()), allowed, message)

@@ -25,11 +25,13 @@ __all__ = [
     "block_diagonal",
     "cached_by_entries",
     "enlarged",
+    "in_units",
     "readonly_array",
     "real_numbers",
     "is_definite",
     "is_semidefinite",
     "as_kernel_array",
+    "row_units",
     "spectral_root",
     "square_root",
     "symmetric",
@@ -101,6 +103,20 @@ def real_numbers(value: ArrayLike) -> FloatArray:
 def symmetric(matrices: FloatArray) -> FloatArray:
     """Return the symmetric parts (..., n, n) of ``matrices``, one or a stack."""
     return np.asarray(0.5 * (matrices + np.swapaxes(matrices, -1, -2)))
+
+
+def row_units(variances: FloatArray) -> FloatArray:
+    """Return units (..., n) in which ``variances`` (..., n) are 1. Those that are rounding of zero
+    beside the largest have no units, and get its; all 1 if all are 0.
+    """
+    largest = np.asarray(variances).max(axis=-1, keepdims=True)
+    units = np.sqrt(np.where(variances > 1e-13 * largest, variances, largest))
+    return np.asarray(np.where(largest > 0.0, units, 1.0))
+
+
+def in_units(matrices: FloatArray, units: FloatArray) -> FloatArray:
+    """Return covariances ``matrices`` (..., n, n) in ``units`` (..., n) of their rows."""
+    return np.asarray(matrices / units[..., :, None] / units[..., None, :])
 
 
 def is_semidefinite(matrix: FloatArray) -> bool:

@@ -350,3 +350,13 @@ class LateSwaps(Gossip):
     """Swaps from slot 3 on."""
 
     timing = replace(Gossip.timing, first_slot=3)
+
+
+@dataclass(frozen=True, eq=False)
+class OverconfidentInOneState(Gossip):
+    """Reports too little covariance of its last state."""
+
+    def estimate(self, state):
+        xhat, P = super().estimate(state)
+        units = np.append(np.ones(len(P) - 1), 0.9)
+        return xhat, P * np.outer(units, units)

@@ -385,7 +385,7 @@ def test_one_fault_of_the_record_is_one_broken_row(tmp_path, monkeypatch):
     assert broken_rows(verdict) == ["states are those that the plant draws, errors are x - xhat"]
     (row,) = [row for row in verdict.rows if row.verdict == BROKEN]
     assert (row.seen, row.expected, row.replica) == (10.0, 0.0, 0)
-    assert "in run 0 x at" in row.evidence
+    assert "in run 0 x[0] at" in row.evidence
 
 
 def test_events_that_contradict_each_other_are_a_verdict_and_no_traceback(tmp_path, monkeypatch):

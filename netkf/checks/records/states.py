@@ -9,9 +9,10 @@ import numpy as np
 import scipy
 
 from netkf.algorithms.registry import own_attributes
-from netkf.checks.evidence import EPS, OPERATIONS, allowed_deviation, largest_terms
+from netkf.checks.evidence import EPS, OPERATIONS, allowed_deviation
 from netkf.checks.parts.noises import pieces_between
-from netkf.linalg.arrays import FloatArray, enlarged
+from netkf.checks.samples import covariance_units, rounded_terms
+from netkf.linalg.arrays import FloatArray, in_units, row_units
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run, first_difference, states_of_nodes
@@ -56,21 +57,29 @@ def _status_fault(scenario: Scenario, run: Run) -> str:
 
 def _truth_fault(scenario: Scenario, run: Run) -> str:
     expected, allowed = drawn_states(scenario, run.seed, run.replica, run.times)
-    away = np.where(scenario.unknown, 0.0, np.abs(run.x - expected))
-    gap = np.nan_to_num(away.max(axis=1, initial=0.0), nan=np.inf)
-    if not (gap > allowed).any():
+    gap = np.where(scenario.unknown, 0.0, np.nan_to_num(np.abs(run.x - expected), nan=np.inf))
+    wrong = gap > allowed
+    if not wrong.any():
         return ""
-    k = int(np.argmax(gap > allowed))
+    k, i = np.argwhere(wrong)[0].tolist()
     return (
-        f"x at {run.times[k]:g} s is {gap[k]:.3g} away from the state that the plant draws, "
-        f"rounding explains {allowed[k]:.1e}"
+        f"x[{i}] at {run.times[k]:g} s is {gap[k, i]:.3g} away from the state that the plant "
+        f"draws, rounding explains {allowed[k, i]:.1e}"
     )
+
+
+def _sizes(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return units (n,) of states x (T, n) in which they are at most 1, and their sizes (T,)."""
+    sizes = np.nan_to_num(np.abs(x), posinf=np.finfo(float).max)
+    largest = sizes.max(axis=0, initial=0.0)
+    units = np.where(largest > 0.0, largest, 1.0)
+    return units, (sizes / units).max(axis=1, initial=0.0)
 
 
 def drawn_states(
     scenario: Scenario, seed: int, replica: int, times: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the states (T, n) drawn again at ``times``, and differences (T,) by rounding."""
+    """Return the states (T, n) drawn again at ``times``, and differences (T, n) by rounding."""
     streams, truth = Streams(seed, replica), None
     moments: list[Any]
     if scenario.slotted:
@@ -79,13 +88,13 @@ def drawn_states(
     else:
         truth, moments = scenario.continuous_truth(streams, frames=False), times.tolist()
     x = np.array([truth.absolute(moment) for moment in moments]).reshape(-1, scenario.plant.n)
-    sizes = np.abs(x).max(axis=1, initial=0.0)
+    units, sizes = _sizes(x)
     # Roundings of a state grow as the plant does, also in directions in which the state does not.
     plant: Any = scenario.plant
     allowed = TRUTH_TOLERANCE * np.maximum.accumulate(sizes)
     if not plant.linear:
         # How far roundings grow is unknown: kernels and Python draw the same numbers.
-        return x, 1e3 * allowed
+        return x, 1e3 * allowed[:, None] * units
     changes = plant.change_slots if scenario.slotted else plant.changes.tolist()
     for k in range(1, len(x)):
         step = np.eye(scenario.plant.n)
@@ -95,18 +104,21 @@ def drawn_states(
                     step = np.linalg.matrix_power(piece.F, gap) @ step
                 else:
                     step = scipy.linalg.expm(piece.A * gap) @ step
+            step = step * units / units[:, None]
             growth = float(np.linalg.norm(step, 2)) if np.isfinite(step).all() else np.inf
         allowed[k] = max(allowed[k], growth * (allowed[k - 1] + ROUNDINGS * EPS * sizes[k - 1]))
-    return x, allowed
+    return x, allowed[:, None] * units
 
 
 def _error_fault(scenario: Scenario, run: Run) -> str:
     x = states_of_nodes(run.x, len(run.nodes), run.xhat.shape[2], scenario.views)
+    units, size = _sizes(run.x)
+    units = states_of_nodes(units[None], len(run.nodes), run.xhat.shape[2], scenario.views)
     with np.errstate(over="ignore", invalid="ignore"):
-        gap = np.where(scenario.is_estimated, np.abs(x - run.xhat - run.error), 0.0)
-        sizes = np.where(scenario.is_estimated, np.abs(run.xhat), 0.0)
-        size = np.abs(run.x).max(axis=1)[:, None] + sizes.max(axis=2)
-        wrong = gap.max(axis=2, initial=0.0) > SUM_ROUNDINGS * EPS * size + 1e-300
+        gap = np.where(scenario.is_estimated, np.abs(x - run.xhat - run.error) / units, 0.0)
+        sizes = np.where(scenario.is_estimated, np.abs(run.xhat) / units, 0.0)
+        allowed = SUM_ROUNDINGS * EPS * (size[:, None] + sizes.max(axis=2))
+        wrong = gap.max(axis=2, initial=0.0) > allowed + 1e-300
     if not wrong.any():
         return ""
     k, i = np.argwhere(wrong)[0].tolist()
@@ -146,18 +158,22 @@ def start_fault(scenario: Scenario, run: Run) -> str:
     plant, start = scenario.plant, scenario.filter
     for k, node in enumerate(scenario.nodes):
         view = np.arange(plant.n)[scenario.view(k)]
-        square, size = np.ix_(view, view), len(view)
+        square, size, units = np.ix_(view, view), len(view), np.ones(len(view))
         for name, given, default, entries, seen in (
-            ("estimate", start.mean, plant.start_mean, view, run.xhat[0, k, :size]),
             ("covariance", start.cov, plant.start_cov, square, run.P[0, k, :size, :size]),
+            ("estimate", start.mean, plant.start_mean, view, run.xhat[0, k, :size]),
         ):
             value = given[k] if isinstance(given, tuple) else given
             expected = np.asarray(default if value is None else value)[entries]
             if np.isnan(seen).all():  # a filter without covariances
                 continue
-            gap = np.abs(seen - expected).max()
-            if not gap <= START_TOLERANCE * np.abs(expected).max():
-                return f"the {name} of node {node} at time 0 is {gap:.3g} off that of [filter]"
+            if name == "covariance":
+                units = row_units(np.diagonal(expected))
+            unit = units if name == "estimate" else np.outer(units, units)
+            gap = np.abs(seen - expected) / unit
+            if not gap.max() <= START_TOLERANCE * (np.abs(expected) / unit).max():
+                off = (gap * unit).flat[np.argmax(gap)]
+                return f"the {name} of node {node} at time 0 is {off:.3g} off that of [filter]"
     return "" if own_attributes(scenario.filter.algorithm) else weight_fault(scenario)
 
 
@@ -183,41 +199,40 @@ def twin_fault(scenario: Scenario, run: Run, twin: Run) -> str:
             k, i = np.argwhere(wrong)[0].tolist()
             return (
                 f"{name} of node {run.nodes[i]} at {run.times[k]:g} s differs by {gap[k, i]:.2e}, "
-                f"rounding explains {allowed[k, i]:.0e}"
+                f"rounding explains {allowed[k, i]:.0e} (in largest deviations of each state)"
             )
     return ""
 
 
 def _gaps(scenario: Scenario, run: Run, twin: Run) -> list[tuple[str, FloatArray, FloatArray]]:
     """Return names of values, the differences (T, N) of two runs, and what rounding explains."""
-    covs = [scenario.initial_estimate(node)[1] for node in scenario.nodes]
-    rows, columns = np.max([cov.shape for cov in covs], axis=0)
-    starts = np.stack([enlarged(cov, rows, columns) for cov in covs])
     # Errors of unknown states are nan in both, as are states that a node does not estimate.
     unknown = np.isnan(twin.error) & np.isnan(run.error) & np.isfinite(twin.xhat)
     error, run_error = (np.where(unknown, 0.0, one.error) for one in (twin, run))
     missing = np.isnan(twin.xhat)
     outside = missing & np.isnan(run.xhat) & ~missing.all(axis=2, keepdims=True)
     of_P = outside[..., :, None] | outside[..., None, :]
-    information = float(np.linalg.norm(scenario.node_infos[0].information, 2))
     twin_P = np.where(of_P, 0.0, twin.P)
     given = np.asarray(np.isfinite(twin_P).all(axis=(2, 3)))
     P = np.where(given[..., None, None], twin_P, 0.0)
+    units = covariance_units(scenario, np.arange(len(scenario.nodes)), P)
+    P = in_units(P, units.of_nodes)
     size = np.abs(P).max(axis=(2, 3), initial=0.0)
-    terms = largest_terms(P[None], starts, information)[0]
+    terms = rounded_terms(scenario, P[None], units)[0]
     with np.errstate(over="ignore", invalid="ignore"):
-        gaps = np.where(of_P, 0.0, np.abs(run.P - twin.P))
+        gaps = in_units(np.where(of_P, 0.0, np.abs(run.P - twin.P)), units.of_nodes)
         covariance = np.where(given, gaps.max(axis=(2, 3), initial=0.0), 0.0)
         estimate, state = (
-            np.where(outside, 0.0, np.abs(one - other)).max(axis=2, initial=0.0)
+            (np.where(outside, 0.0, np.abs(one - other)) / units.of_nodes).max(axis=2, initial=0.0)
             for one, other in ((run_error, error), (run.xhat, twin.xhat))
         )
     # An estimate inherits the relative rounding of the largest covariance so far, by which its
     # gains were computed, and those of the errors and states that it comes from.
     deviation = np.sqrt(np.trace(P, axis1=2, axis2=3))
-    own = np.where(outside, 0.0, np.abs(error))
-    errors = np.maximum.accumulate(own.max(axis=(1, 2), initial=0.0))[:, None]
-    states = np.maximum.accumulate(np.nan_to_num(np.abs(twin.x)).max(axis=1, initial=0.0))[:, None]
+    errors = np.where(outside, 0.0, np.abs(error)) / units.of_nodes
+    errors = np.maximum.accumulate(errors.max(axis=(1, 2), initial=0.0))[:, None]
+    states = np.nan_to_num(np.abs(twin.x)) / units.of_states
+    states = np.maximum.accumulate(states.max(axis=1, initial=0.0))[:, None]
     spread = np.divide(terms, np.square(deviation), out=np.ones_like(size), where=deviation > 0.0)
     rounding = OPERATIONS * EPS * errors * np.maximum.accumulate(np.maximum(spread, 1.0))
     rounding = rounding + OPERATIONS * EPS * (0.0 if twin.exact_errors else states)

@@ -14,6 +14,7 @@ import numpy as np
 import scipy
 
 from netkf.algorithms.gates import Gate
+from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import noise_root
 from netkf.network.clocks import Periodic
@@ -21,6 +22,7 @@ from netkf.plants.faults import Fault, Outliers
 from netkf.plants.transitions import Transitions
 from netkf.scenario.model import PlacedSensor
 from netkf.scenario.scenario import Scenario
+from netkf.theory.intermittent.riccati import steady_covariance
 
 MAX_READINGS = 100_000
 """Readings of a bad time that are looked at."""
@@ -123,8 +125,8 @@ def _alone(scenario: Scenario, H: FloatArray, R: FloatArray, step: float) -> _Al
         laws = Transitions(A, noise_root(BB)).laws(np.array([step]))
         F, Q = laws[0][0], laws[1][0] @ laws[1][0].T
     try:
-        P = scipy.linalg.solve_discrete_are(F.T, H.T, Q, R)
-    except (np.linalg.LinAlgError, ValueError):
+        P = steady_covariance(F, Q, H, R)
+    except TheoryError:
         return None
     S = H @ P @ H.T + R
     return _Alone(F, P @ H.T @ np.linalg.inv(S), H, S)

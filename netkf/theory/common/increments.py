@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from netkf.algorithms.kernels.riccati import state_units
 from netkf.linalg.arrays import FloatArray, IntArray, square_root
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.forms import MEAN, Forms
@@ -42,7 +43,7 @@ class IncrementFlows(NamedTuple):
     @property
     def unit(self) -> float:
         """The time (seconds) over which series and quadrature of all flows hold."""
-        return min(flow.unit for flow, _ in self.groups)
+        return min(self.plant.unit, *(flow.unit for flow, _ in self.groups))
 
     def without(self, silent: Collection[int]) -> IncrementFlows | None:
         """Return the flows of all but ``silent`` estimators (indices), None if all are."""
@@ -147,7 +148,9 @@ def increment_flows(
             flows[key] = _error_flow((A, B), plant, observation, pace, follows)
     groups = [(flows[key], np.array(members[key])) for key in flows]
     reading = [h for indices in members.values() for h in indices]
-    return IncrementFlows(groups, reading, StateFlow(*plant), follows, scenario.surprise)
+    first = observations[reading[0]]
+    units = state_units(A, Q, first.H.T @ np.linalg.solve(first.R, first.H))
+    return IncrementFlows(groups, reading, StateFlow(*plant, units), follows, scenario.surprise)
 
 
 def _error_flow(
@@ -163,11 +166,12 @@ def _error_flow(
     (A, B), H, noise = believed, observation.H, plant[1]
     # The filter moves so much further, and its gain P H' R^-1 is that of its own time.
     A, B, R = pace * A, math.sqrt(pace) * B, pace * observation.R
+    units = state_units(A, B @ B.T, H.T @ np.linalg.solve(R, H))
     if follows:
         # d(x, e) = (A x, (A - A_f) x + (A_f - L H) e) dt + (B, B) dw, less the noise of L dv in e.
         # Of dy = H x dt + dv the filter expects pace H xhat dt.
         zero, noise = np.zeros_like(A), np.concatenate([noise, noise])
         B = np.concatenate([np.zeros_like(B), B])
         A = np.block([[plant[0], zero], [plant[0] - A, A]])
-        H = np.concatenate([(1.0 - pace) * H, pace * H], axis=1)
-    return ErrorFlow(A, B, H, R, observation.root, noise)
+        H, units = np.concatenate([(1.0 - pace) * H, pace * H], axis=1), np.tile(units, 2)
+    return ErrorFlow(A, B, H, R, observation.root, noise, units)

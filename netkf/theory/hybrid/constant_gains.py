@@ -39,12 +39,12 @@ def constant_gain_bound(
     The bound is the mean of P_i itself if every node uses its L_i (derived). Raises TheoryError for
     sampled sensors, delays and wrong shapes, and if there is no steady state.
     """
-    linear, constant = _linear_equation(scenario, gains)
-    packed = linear.packed
+    linear, constant, units = _linear_equation(scenario, gains)
+    packed, scale = linear.packed, np.outer(units, units)
     if times is None:
         if not is_stable(linear):
             raise TheoryError("constant gains do not stabilise the filters: no steady state")
-        return packed.unpack(solve_map(linear, constant))
+        return np.asarray(packed.unpack(solve_map(linear, constant)) * scale)
     moments = as_times(times)
     # An entry that stays 1 makes the constant term part of a linear map.
     column = scipy.sparse.csc_array(constant.reshape(-1, 1))
@@ -64,14 +64,16 @@ def constant_gain_bound(
                 y = scipy.sparse.linalg.expm_multiply(all_times * (gap / steps), y)
         if not np.isfinite(y).all():
             raise TheoryError(f"the bound overflows within {gap:g} s: give earlier times")
-        bounds.append(packed.unpack(y[:-1].reshape(constant.shape)))
+        bounds.append(packed.unpack(y[:-1].reshape(constant.shape)) * scale)
     return np.array(bounds)
 
 
 def _linear_equation(
     scenario: Scenario, gains: Sequence[ArrayLike] | None
-) -> tuple[LinearisedRiccati, FloatArray]:
-    """Return map and constant of dP/dt = map(P) + ``L_i R_i L_i' + Q``; raises TheoryError."""
+) -> tuple[LinearisedRiccati, FloatArray, FloatArray]:
+    """Return map and constant of dP/dt = map(P) + ``L_i R_i L_i' + Q`` in natural units of states,
+    and these (n,); raises TheoryError.
+    """
     equations = coupled_riccati(scenario)
     if equations.samples or equations.jumps or equations.delay:
         raise TheoryError("constant gains are for sensors in continuous time and no delay")
@@ -83,8 +85,12 @@ def _linear_equation(
     gain_matrices = [as_numbers("gains", L) for L in as_list("gains", gains)]
     if [L.shape for L in gain_matrices] != [(n, len(H)) for H, _ in observations]:
         raise TheoryError("gains must have one (n, p_i) array for each node")
-    pairs = list(zip(gain_matrices, observations, strict=True))
+    equations, units = equations.in_natural_units()
+    pairs = [
+        (L / units[:, None], (H * units, R))
+        for L, (H, R) in zip(gain_matrices, observations, strict=True)
+    ]
     corrections = np.array([L @ H for L, (H, _) in pairs])
     packed = PackedRiccati(equations)
     constant = packed.pack(np.array([L @ R @ L.T for L, (_, R) in pairs]) + equations.Q)
-    return packed.linear_with_gains(corrections), constant
+    return packed.linear_with_gains(corrections), constant, units

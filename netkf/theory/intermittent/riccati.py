@@ -13,6 +13,7 @@ import numpy as np
 import scipy
 
 from netkf.algorithms.kernels.chains import move_roots, reading_modes
+from netkf.algorithms.kernels.riccati import change_units, state_units
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import ArrayLike, FloatArray, square_root, symmetric
 from netkf.linalg.spectra import FACTOR, eigenvalues, growth_factor, hidden_mode
@@ -121,6 +122,13 @@ def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) ->
     hidden = undetectable_slot_mode(F, H)
     if hidden is not None:
         raise TheoryError(f"(F, H) is not detectable: the mode with eigenvalue {hidden:.6g}")
+    units = state_units(F, Q, H.T @ np.linalg.solve(R, H))
+    P = _stabilising(*change_units(units, F, Q, H), R)
+    return np.asarray(P * units * units[:, None])
+
+
+def _stabilising(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
+    """Return ``steady_covariance`` of a detectable plant in balanced units of states."""
     try:
         P = np.zeros_like(F)
         # Else the step below solves the equation, where P* may be 0 and rounding all of P.

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import scipy
 
+from netkf.algorithms.kernels.riccati import change_units, move_covariances, state_units
 from netkf.algorithms.kernels.riccati import flow_covariance as flow_over
-from netkf.algorithms.kernels.riccati import move_covariances
 from netkf.core.errors import TheoryError
 from netkf.core.printable import MAX_RUNS
 from netkf.linalg.arrays import (
@@ -21,7 +21,7 @@ from netkf.linalg.arrays import (
     square_root,
     symmetric,
 )
-from netkf.linalg.spectra import RATE, growth_rate, hidden_mode, outputs_of
+from netkf.linalg.spectra import RATE, balance, growth_rate, hidden_mode, outputs_of
 
 RESIDUAL = 1e-9  # of an equation, relative to its terms: larger ones mean a failed solver
 ROUNDING, NEWTON_STEPS = 1e-13, 4  # of a Riccati equation: what ends refinement, and when it must
@@ -138,12 +138,22 @@ def riccati_flow(P: ArrayLike, A: ArrayLike, Q: ArrayLike, G: ArrayLike, gap: fl
 
 
 def algebraic_riccati(A: FloatArray, Q: FloatArray, G: FloatArray) -> FloatArray:
-    """Return the stabilising solution S of ``0 = A S + S A' + Q - S G S``; TheoryError without."""
+    """Return the stabilising solution S of ``0 = A S + S A' + Q - S G S``; TheoryError without. It
+    is computed in units of states in which A, Q and G (n, n) are balanced.
+    """
     hidden = undetectable_mode(A, G)
     if hidden is not None:
         raise TheoryError(
             f"(A, H) is not detectable: the mode with eigenvalue {hidden:.6g} is not seen"
         )
+    units = state_units(A, Q, G)
+    A, Q, G = change_units(units, A, Q, G)
+    S = _stabilising(A, Q, units[:, None] * G)
+    return np.asarray(S * units * units[:, None])
+
+
+def _stabilising(A: FloatArray, Q: FloatArray, G: FloatArray) -> FloatArray:
+    """Return the solution of ``algebraic_riccati`` of a detectable plant in balanced units."""
     if len(A) <= MAX_STATES:
         with suppress(np.linalg.LinAlgError, TheoryError):
             # S = V U^-1 for the stable eigenvectors (U, V) of the Hamiltonian matrix.
@@ -182,11 +192,13 @@ def lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
     """Return X (n, n) with ``0 = A X + X A' + Q``; raises TheoryError for an unstable A."""
     if not growth_rate(A) < 0.0:
         raise TheoryError("the error dynamics are not stable, their covariance has no limit")
+    A, units = balance(A)
+    Q = Q / units / units[:, None]
     X = _solve_lyapunov(A, Q)
     residual = np.abs(A @ X + X @ A.T + Q).max()
     if not residual <= RESIDUAL * (np.abs(A @ X).max() + np.abs(Q).max()):
         raise TheoryError(f"the Lyapunov equation was solved to {residual:.1e} only")
-    return X
+    return np.asarray(X * units * units[:, None])
 
 
 def _solve_lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:

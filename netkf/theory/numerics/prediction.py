@@ -45,7 +45,8 @@ class ShortExponential:
 class ErrorFlow:
     """Errors of filters with the same continuous readings H (p, n); p = 0 for filters without any.
 
-    Transitions are over at most ``unit`` seconds.
+    Transitions are over at most ``unit`` seconds. They are computed in ``units`` (n,) of states, in
+    which |M| is small and no digits are lost, whatever those of the plant.
     """
 
     def __init__(
@@ -56,10 +57,13 @@ class ErrorFlow:
         R: FloatArray,
         noise: FloatArray,
         plant: FloatArray,
+        units: FloatArray,
     ) -> None:
         """Take A (n, n), B (n, m), H (p, n) and R (p, p) as the filters assume them, a root
         ``noise`` (p, p) of the true R, and the true B of the ``plant``; A is the true one.
         """
+        self._units = units[:, None]
+        A, B, H, plant = A * units / self._units, B / self._units, H * units, plant / self._units
         root_R, weight = np.linalg.cholesky(R), np.linalg.solve(R, H).T
         self._H = np.linalg.solve(root_R, H)
         # What enters errors by X' and Y': noises as filters assume them, and true ones.
@@ -93,6 +97,8 @@ class ErrorFlow:
         of the plant's 8 m inputs, and the first of n inputs of each error.
         """
         n, weights = errors.shape[1], np.sqrt(WEIGHTS * gap)[:, None, None]
+        errors /= self._units
+        roots /= self._units
         upper, lower, F, Gamma, start = self._over(gap)
         # L L' = I + S' G S, so that J = (I + P G)^-1 = I - S (L L')^-1 S' G and S L^-T is a root of
         # J P.
@@ -111,6 +117,8 @@ class ErrorFlow:
         for e, own in enumerate(_narrowed(_side_by_side(noises[..., self._m :]))):
             first = columns[1] + e * n
             errors[e, :, first : first + own.shape[1]] += own
+        errors *= self._units
+        roots *= self._units
 
 
 def _side_by_side(parts: FloatArray) -> FloatArray:
@@ -126,13 +134,15 @@ def _narrowed(factor: FloatArray) -> FloatArray:
 
 class StateFlow:
     """The true state dx = A x dt + B dw over gaps of at most ``unit`` seconds; A (n, n), B (n, m).
+    Transitions are computed in ``units`` (n,).
 
     inputs : 8 m, the m of the noise at each of 8 quadrature nodes (instants of the gap)
     """
 
-    def __init__(self, A: FloatArray, B: FloatArray) -> None:
+    def __init__(self, A: FloatArray, B: FloatArray, units: FloatArray) -> None:
         """Take A (n, n), per second, and B (n, m) of m noises of variance 1 per second."""
-        self._exp, self._B = ShortExponential(A), B
+        self._units, self._B = units, B / units[:, None]
+        self._exp = ShortExponential(A * units / units[:, None])
         self.unit = self._exp.unit
         self.inputs = len(NODES) * B.shape[1]
         self._over = lru_cache(maxsize=1)(self._matrices_over)
@@ -144,4 +154,5 @@ class StateFlow:
     def _matrices_over(self, gap: float) -> tuple[FloatArray, FloatArray]:
         E = self._exp(np.append((1.0 - NODES) * gap, gap))
         root_weights = np.sqrt(WEIGHTS * gap)[:, None, None]
-        return E[-1], _side_by_side(root_weights * (E[:-1] @ self._B))
+        response, rows = _side_by_side(root_weights * (E[:-1] @ self._B)), self._units[:, None]
+        return E[-1] * rows / self._units, response * rows

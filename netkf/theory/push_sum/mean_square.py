@@ -206,9 +206,10 @@ def large_gamma_limits(scenario: Scenario) -> LargeGamma:
     block = steps.noise.reshape(N, n, N, n).sum(axis=(0, 2)) / N
     noise = np.zeros((N * n, N * n))
     noise[:n, :n] = symmetric(block)
-    # X = A_C X A_C' + noise, with A_C the mean closed loop.
-    X = scipy.linalg.solve_discrete_lyapunov(steps.closed.mean(axis=0), block / N)
-    return LargeGamma(noise, symmetric(np.asarray(X)))
+    # X = A_C X A_C' + noise, with A_C the mean closed loop, in units of P_inf's deviations.
+    covariance = np.outer(steps.scale, steps.scale)
+    X = scipy.linalg.solve_discrete_lyapunov(steps.scaled.mean(axis=0), block / N / covariance)
+    return LargeGamma(noise, symmetric(np.asarray(X)) * covariance)
 
 
 def push_sum_noise(scenario: Scenario, gammas: Sequence[int]) -> FloatArray:
