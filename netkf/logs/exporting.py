@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -92,7 +93,7 @@ def _outcomes(scenario: Scenario, messages: np.ndarray, channel: dict[str, Any])
     # What was lost on arrival took its time: its hearer was down.
     took = messages["ended"] - messages["sent"]
     arrives = (messages["outcome"] != LOST) | (took > 0.0)
-    later = scenario.end_time + 1.0 - messages["sent"]
+    later = math.ceil(scenario.end_time) + 1.0  # whole seconds divide no grid of time
     took = np.where(messages["outcome"] == UNDER_WAY, later, took)
     rows = pd.DataFrame({name: messages[name] for name in ("sender", "receiver")})
     rows["message"] = messages["number"]

@@ -180,8 +180,9 @@ def _outcome_tables(log: PacketLog, outcomes: pd.DataFrame) -> tuple[pd.DataFram
     table["delivered"] = outcomes["heard"]
     table["t"], table["transmission"] = sends["t"], outcomes["send"]
     table["channel"], table["rssi"] = sends["channel"], outcomes["rssi"]
-    # A message that is heard after the end of the log is never heard in a run.
-    delay = outcomes["delay"].replace(np.inf, 2.0 * float(log.sends["t"].max()) + 1.0)
+    # A message that is heard after the end of the log is never heard in a run. Whole seconds divide
+    # no grid of time.
+    delay = outcomes["delay"].replace(np.inf, 2.0 * math.ceil(log.sends["t"].max()) + 1.0)
     table["delay"], table["why"] = delay, outcomes["why"]
     is_known = table["delivered"].notna()
     unknown = table[~is_known].drop(columns=["delivered", "rssi", "delay"])

@@ -227,8 +227,10 @@ def reached(state: Simulation, first: int, after: int, outcome: int) -> int:
     found = NONE_SENT
     for m in range(after - first):
         delay = state.ticks.delay[outcome + m]
-        hearer = state.directions[state.outgoing[first + m]].receiver
-        if delay > 0.0 or (delay == 0.0 and state.nodes[hearer].down == 0):
+        way = state.directions[state.outgoing[first + m]]
+        if state.nodes[way.sender].down == 1:
+            continue  # the other end of a link sends alone
+        if delay > 0.0 or (delay == 0.0 and state.nodes[way.receiver].down == 0):
             return SOME_ARRIVE
         if delay != OUT_OF_RANGE:
             found = ALL_LOST
