@@ -5,7 +5,6 @@ None of them is imported: a model is known by its attributes.
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping
 from decimal import Decimal
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import covariance, definite_covariance, matrix, positive, vector
+from netkf.core.printable import one_line
 from netkf.core.stamps import EXACT
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import noise_root
@@ -76,8 +76,13 @@ def _as_space(system: Any) -> Any:
     """Return ``system`` as a state space; raises ScenarioError if it is none."""
     space = system
     if not (hasattr(system, "A") and hasattr(system, "C")) and hasattr(system, "to_ss"):
-        with contextlib.suppress(TypeError):  # responses by frequency have no state
+        try:
             space = system.to_ss()
+        except TypeError:  # responses by frequency have no state
+            pass
+        except (ValueError, NotImplementedError) as error:  # derivatives, or a library is missing
+            rule = f"has no state space: {one_line(error)}".rstrip(".")
+            raise ScenarioError("system", rule, type(system).__name__, "give one") from None
     if not all(hasattr(space, name) for name in ("A", "B", "C", "D", "dt")):
         remedy = "give control.ss(system), or one of scipy.signal.StateSpace"
         raise ScenarioError("system", "must be a state space", type(system).__name__, remedy)

@@ -98,6 +98,10 @@ def test_a_run_of_a_filterpy_filter_is_that_filter():
     [
         (lambda: netkf.from_control(3, 1, 1), "system: must be a state space; got 'int'"),
         (lambda: netkf.from_control(frequencies(), 1, 1), "system: must be a state space; got 'F"),
+        (
+            lambda: netkf.from_control(signal.TransferFunction([1.0, 0.0, 0.0], [1.0, 1.0])),
+            "system: has no state space: Improper",
+        ),
         (lambda: netkf.from_control(rotating(), np.eye(2), R), "A: must be a matrix"),
         (lambda: netkf.from_control(SYSTEM, np.eye(3), R), "Q: must have 2 rows"),
         (lambda: netkf.from_control(SYSTEM, np.eye(2), 1.0), "R: must have 2 rows"),
