@@ -62,10 +62,13 @@ MOTIONS = {
 
 @dataclass(frozen=True, eq=False)
 class CustomDynamics(Component):
-    """An object ``part`` of a user's class whose ``name`` is "module:Class"."""
+    """An object ``part`` of a user's class whose ``name`` is "module:Class"; ``is_default`` if the
+    class makes one like it without arguments.
+    """
 
     name: str
     part: Any
+    is_default: bool = True
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, CustomDynamics):
@@ -203,13 +206,26 @@ def _convert(value: Any) -> Any:
         for method, function in zip(("f", "jacobian"), pair, strict=True):
             if problem := kernel_problem(function, ("x", "u", "t", "out")):
                 raise ScenarioError("", f"its kernel {method} {problem}", name, remedy)
-        return CustomDynamics(name, part)
+        return CustomDynamics(name, part, part is not value or _is_default(part))
     wanted = ("f", "jacobian")
     for method in wanted:
         if not callable(getattr(part, method, None)):
             rule = f"must have a method {method}(x, u, t)"
             raise ScenarioError("", rule, name, "write it; x is (n,), u (m,) and t in seconds")
-    return CustomDynamics(name, part)
+    return CustomDynamics(name, part, part is not value or _is_default(part))
+
+
+def _is_default(part: Any) -> bool:
+    """Return True if its class without arguments makes an object of the same numbers and texts."""
+    try:
+        other = type(part)()
+    except Exception:
+        return False
+    return all(
+        str(value) == str(getattr(other, key, None))
+        for key, value in getattr(part, "__dict__", {}).items()
+        if isinstance(value, bool | int | float | str | tuple | list | np.ndarray | np.generic)
+    )
 
 
 _listed = ", ".join(f'"{name}"' for name in MOTIONS)

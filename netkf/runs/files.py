@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 
 from netkf.core.errors import ScenarioError, WriteError
-from netkf.core.fields import SourceFile, as_path
+from netkf.core.fields import SourceFile, as_path, walk
+from netkf.plants.dynamics import CustomDynamics
 from netkf.scenario.plugins import find_module_files, find_unimportable_class, imported_source
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import source_files
@@ -241,6 +242,11 @@ def check_sources(scenario: Scenario) -> None:
         rule = f"cannot name the class {name} of this script, notebook or function"
         remedy = "put it into a module (a .py file beside the scenario) and import it from there"
         raise ScenarioError("scenario.toml", rule, None, remedy)
+    for part in walk(scenario):
+        if isinstance(part, CustomDynamics) and not part.is_default:
+            rule = f"cannot name an object of {part.name} that was made with arguments"
+            remedy = "give them as defaults, or derive a class that has them"
+            raise ScenarioError("scenario.toml", rule, None, remedy)
     for source in source_files(scenario):
         if source.name in RUN_FILES:
             rule = "is a name that run directories use themselves"

@@ -43,6 +43,23 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 
+class GivenName(str):
+    """The name of a user's class in the table of a part of a scenario, with what was ``given``, the
+    class or the dynamics of a plant: by the name another class may be found by now.
+    """
+
+    given: Any
+
+    def __new__(cls, name: str, given: Any) -> GivenName:
+        """Return the text ``name`` with what it names."""
+        self = super().__new__(cls, name)
+        self.given = given
+        return self
+
+    def __reduce__(self) -> tuple[type[GivenName], tuple[str, Any]]:
+        return GivenName, (str(self), self.given)
+
+
 def user_components(value: Any) -> list[Component]:
     """Return the components in a scenario that are not netkf's, inner ones after outer ones."""
     parts: Iterator[Any] = (part for part in walk(value) if isinstance(part, Component))

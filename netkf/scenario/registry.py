@@ -48,7 +48,13 @@ from netkf.plants.relative import (
 )
 from netkf.plants.sampling import RecordedSampling
 from netkf.plants.sensors import LinearSensor, Sensor
-from netkf.scenario.plugins import Origin, find_class, find_offered_class, offered_kinds
+from netkf.scenario.plugins import (
+    GivenName,
+    Origin,
+    find_class,
+    find_offered_class,
+    offered_kinds,
+)
 
 FAMILIES: dict[str, type[Component]] = {
     "plant": Plant,
@@ -206,6 +212,8 @@ def find_kind(
     Returns None for a user's class that is not loaded and must not be (:class:`Origin`). Raises
     ScenarioError if it does not exist or may not be imported.
     """
+    if isinstance(kind, GivenName):
+        return _require_part(family, kind, kind.given)
     choices = list_names_of_kind(family, kind)
     if choices:
         return KINDS[family][_choose_name(choices, table)]

@@ -29,7 +29,7 @@ from netkf.plants.blocks import Block
 from netkf.plants.states import state_file
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.model import Belief, Filtering, Metrics, Network
-from netkf.scenario.plugins import Origin, explain_user_error, find_class
+from netkf.scenario.plugins import GivenName, Origin, explain_user_error, find_class
 from netkf.scenario.registry import KINDS, SLOTTED, find_kind, list_names_of_kind
 from netkf.scenario.time_grid import Time
 from netkf.scenario.writing import as_table, part_as_table
@@ -300,6 +300,8 @@ def _build_block(origin: Origin, value: Any) -> Any:
 
 def _find_dynamics(origin: Origin, value: Any) -> Any:
     """Return the class that "module:Class" names, other values as they are."""
+    if isinstance(value, GivenName):
+        return value.given
     if not isinstance(value, str) or ":" not in value:
         return value
     try:

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.registry import split_choice
+from netkf.core.contracts import is_netkf_class
 from netkf.core.fields import Component, SourceFile
 from netkf.network.channels import Channel
 from netkf.network.clocks import LinkClock
@@ -28,6 +29,7 @@ from netkf.plants.sensors import Sensor
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.model import Belief, Filtering, Network
 from netkf.scenario.names import map_nodes
+from netkf.scenario.plugins import GivenName
 from netkf.scenario.registry import FAMILIES, name_of
 
 
@@ -128,6 +130,8 @@ def _part_table(part: Component, style: _Style) -> dict[str, Any]:
     # Every clock of links is of two families.
     name = name_of("activation" if isinstance(part, LinkClock) else family, part)
     kind, choice = split_choice(name)
+    if not is_netkf_class(type(part)):
+        kind = GivenName(kind, type(part))
     return {"kind": kind, **choice, **values}
 
 
@@ -165,7 +169,7 @@ def _toml_value(value: Any, style: _Style) -> Any:
     if isinstance(value, tuple):
         return [_toml_value(item, style) for item in value]
     if isinstance(value, CustomDynamics):
-        return value.name
+        return GivenName(value.name, value)
     return _part_table(value, style) if isinstance(value, Component) else value
 
 

@@ -567,6 +567,25 @@ class Forgetful(Pendulum):
         return super().f(x, u, t) + 1e-9 * self.calls
 
 
+class Weighted(Pendulum):
+    def __init__(self, weight=1.0):
+        self.weight, self.calls = weight, 0
+
+    def f(self, x, u, t):
+        self.calls += 1
+        return self.weight * super().f(x, u, t)
+
+
+def test_an_object_stays_and_what_its_class_alone_does_not_give_is_not_saved(custom, tmp_path):
+    scenario = netkf.load(custom, {"plant.f": Weighted(0.5)})
+    for same in (scenario.replace({"seed": 5}), scenario.replace({"plant.states": ["a", "b"]})):
+        assert same.plant.f.part.weight == 0.5
+    with pytest.raises(netkf.ScenarioError, match="was made with arguments"):
+        netkf.save(netkf.simulate(scenario), scenario, tmp_path / "out")
+    scenario = scenario.replace({"plant.f": Weighted()})
+    assert netkf.save(netkf.simulate(scenario), scenario, tmp_path / "out").is_dir()
+
+
 def test_check_plant_holds_f_to_its_word():
     def plant(f):
         settings = {"Q": np.diag([1e-4, 1e-3]), "period": 0.1, "cov": 0.1 * np.eye(2)}
