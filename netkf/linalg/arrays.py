@@ -109,7 +109,7 @@ def row_units(variances: FloatArray) -> FloatArray:
     """Return units (..., n) in which ``variances`` (..., n) are 1. Those that are rounding of zero
     beside the largest have no units, and get its; all 1 if all are 0.
     """
-    largest = np.asarray(variances).max(axis=-1, keepdims=True)
+    largest = np.maximum(np.asarray(variances).max(axis=-1, keepdims=True), 0.0)
     units = np.sqrt(np.where(variances > 1e-13 * largest, variances, largest))
     return np.asarray(np.where(largest > 0.0, units, 1.0))
 

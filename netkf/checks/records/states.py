@@ -68,7 +68,7 @@ def _truth_fault(scenario: Scenario, run: Run) -> str:
     )
 
 
-def _sizes(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _units_and_sizes(x: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return units (n,) of states x (T, n) in which they are at most 1, and their sizes (T,)."""
     sizes = np.nan_to_num(np.abs(x), posinf=np.finfo(float).max)
     largest = sizes.max(axis=0, initial=0.0)
@@ -88,7 +88,7 @@ def drawn_states(
     else:
         truth, moments = scenario.continuous_truth(streams, frames=False), times.tolist()
     x = np.array([truth.absolute(moment) for moment in moments]).reshape(-1, scenario.plant.n)
-    units, sizes = _sizes(x)
+    units, sizes = _units_and_sizes(x)
     # Roundings of a state grow as the plant does, also in directions in which the state does not.
     plant: Any = scenario.plant
     allowed = TRUTH_TOLERANCE * np.maximum.accumulate(sizes)
@@ -112,7 +112,7 @@ def drawn_states(
 
 def _error_fault(scenario: Scenario, run: Run) -> str:
     x = states_of_nodes(run.x, len(run.nodes), run.xhat.shape[2], scenario.views)
-    units, size = _sizes(run.x)
+    units, size = _units_and_sizes(run.x)
     units = states_of_nodes(units[None], len(run.nodes), run.xhat.shape[2], scenario.views)
     with np.errstate(over="ignore", invalid="ignore"):
         gap = np.where(scenario.is_estimated, np.abs(x - run.xhat - run.error) / units, 0.0)
@@ -197,9 +197,10 @@ def twin_fault(scenario: Scenario, run: Run, twin: Run) -> str:
         wrong = ~(gap <= allowed)
         if wrong.any():
             k, i = np.argwhere(wrong)[0].tolist()
+            times = gap[k, i] / allowed[k, i] if allowed[k, i] > 0.0 else np.inf
             return (
-                f"{name} of node {run.nodes[i]} at {run.times[k]:g} s differs by {gap[k, i]:.2e}, "
-                f"rounding explains {allowed[k, i]:.0e} (in largest deviations of each state)"
+                f"{name} of node {run.nodes[i]} at {run.times[k]:g} s differs by {times:.2g} times "
+                "what rounding explains"
             )
     return ""
 
