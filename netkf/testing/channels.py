@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import warnings
 from collections.abc import Callable
 from functools import partial
 from itertools import compress
@@ -97,6 +98,7 @@ def check_channel(channel: Any, /, topology: Topology | None = None, **settings:
     the delays on one link that is off by 0.06, and a probability of a loss after a loss that is off
     by 0.05. A correct class fails once in a million checks.
 
+    A UserWarning tells of ``conditions`` that draw nothing: they are the same in all runs.
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
     part = make_part(channel, (Channel, Loss, Delay), settings)
@@ -123,6 +125,13 @@ def _check_channel(part: Any, topology: Topology | None, seed: int) -> None:
     if has_conditions(part):
         draw = partial(watched.call, "conditions", repeatable=False)
         conditions = watched.repeat("conditions", lambda random: draw(random, HORIZON))
+        random = RecordingGenerator(5)
+        draw(random, HORIZON)
+        if not random.take_calls():
+            # Not an error: they may be recorded, or not random for these settings.
+            message = "takes no numbers from its generator, so that they are the same in all runs"
+            remedy = "draw from it what is random"
+            warnings.warn(f"{watched.name}.conditions: {message}; {remedy}", stacklevel=4)
     near = DISTANCES[0] if part.follows_distance else math.nan
     sent = [
         Transmission(link, table_probability=p, distance=near, conditions=conditions)

@@ -149,6 +149,22 @@ def refused(checker, cls, settings, words):
     assert "\n" not in text
 
 
+class OneWeather(parts.Loss):
+    """Its weather is the same in all runs."""
+
+    def conditions(self, random, horizon):
+        return np.cumsum(np.random.default_rng(1).exponential(horizon / 5.0, 9))
+
+    def delivery_probability(self, sent):
+        return 0.5 + 0.5 * (np.searchsorted(sent.conditions, sent.time) % 2)
+
+
+def test_weather_that_is_not_drawn_is_told():
+    with pytest.warns(UserWarning, match="OneWeather.conditions: takes no numbers") as told:
+        check_channel(OneWeather())
+    assert told[0].filename == __file__
+
+
 def test_a_broken_part_of_a_channel_is_named():
     cls, settings, words = CHANNELS["Backwards"]
     with pytest.raises(AssertionError, match=words.partition(";")[0]):
