@@ -21,7 +21,12 @@ import numpy as np
 from netkf.core.errors import ScenarioError, WriteError
 from netkf.core.fields import SourceFile, as_path, walk
 from netkf.plants.dynamics import CustomDynamics
-from netkf.scenario.plugins import find_module_files, find_unimportable_class, imported_source
+from netkf.scenario.plugins import (
+    find_module_files,
+    find_unimportable_class,
+    imported_source,
+    module_sources,
+)
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import source_files
 from netkf.scenario.writing import as_table, resolve_defaults, to_toml
@@ -286,9 +291,7 @@ def scenario_digest(scenario: Scenario, **changed: Any) -> str:
     """Return the SHA-256 of a scenario with all defaults, or ``changed`` keys, and its files."""
     digest = hashlib.sha256(to_toml(resolve_defaults(scenario) | changed).encode())
     contents = {source.name: source.read_bytes() for source in source_files(scenario)}
-    for name, file in find_module_files(scenario).items():
-        if file is not None:
-            contents[f"{name}.py"] = imported_source(file)
+    contents |= module_sources(scenario)
     for name, content in sorted(contents.items()):
         digest.update(name.encode() + b"\0" + hashlib.sha256(content).digest())
     return digest.hexdigest()

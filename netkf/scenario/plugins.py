@@ -412,6 +412,21 @@ def imported_source(file: Path) -> bytes:
     return _sources.get(file.resolve()) or file.read_bytes()
 
 
+def module_sources(scenario: Component) -> dict[str, bytes]:
+    """Return what was imported from the scenario's folder for users' classes, by the names of the
+    files there; of a package all of its modules.
+    """
+    folder = getattr(scenario, "_folder", None) or Path.cwd()
+    files = []
+    for name, file in find_module_files(scenario).items():
+        package = folder / name.partition(".")[0]
+        if file is not None:
+            files.append(file)
+        elif (package / "__init__.py").is_file() and not _is_loaded_package(name):
+            files += package.rglob("*.py")
+    return {file.relative_to(folder).as_posix(): imported_source(file) for file in files}
+
+
 def edited_module(scenario: Component) -> Path | None:
     """Return the file of a module of a user's class that was edited since it was imported."""
     modules = find_module_files(scenario)

@@ -463,6 +463,9 @@ def test_packages_in_the_folder_are_as_modules_there(folder, tmp_path, kind):
     (place / "evil" / "deep.py").write_text(text.format(3.0))
     again = netkf.load(file)
     assert again.filter.algorithm.own == 3.0
+    digest = scenario_digest(again)
     (place / "evil" / "deep.py").write_text(text.format(4.0))
+    assert scenario_digest(again) == digest
     with pytest.raises(netkf.EngineError, match=r"deep.py, which was edited since the scenario"):
         pack_scenario(again)
+    assert scenario_digest(netkf.load(file)) != digest
