@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import math
 import numbers
@@ -60,7 +61,14 @@ class GraphFile(Graph):
         except ScenarioError as error:
             rule = f"{self.path.name}: {error.rule}"
             raise ScenarioError("path", rule, error.value, error.remedy) from None
-        return table.topology(self.minimum, self.positions)
+        topology, points = table.topology(self.minimum, self.positions), None
+        if self.positions is None:
+            points = _positions(graph.nodes.values())
+        if points is None:
+            return topology
+        ids = assign_ids(graph.nodes).values()
+        places = dict(zip(ids, map(tuple, points.tolist()), strict=True))
+        return dataclasses.replace(topology, positions={k: places[k] for k in topology.nodes})
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,6 +36,25 @@ def test_links_have_what_they_carried(run, tmp_path):
     again = netkf.load(tmp_path / "scenario.toml", {"network.graph": table})
     assert again.topology.links == run.scenario.topology.links
     assert again.topology.names == run.scenario.topology.names
+    assert again.topology.positions == run.scenario.topology.positions
+
+
+def test_a_file_has_the_places_of_its_nodes(run, tmp_path):
+    """As the same graph does that is given in Python; netkf's own files lost them."""
+    graph = networkx.cycle_graph(["gate", "roof", "lab"])
+    networkx.set_node_attributes(graph, {"gate": 0.5, "roof": 1.5, "lab": -2.0}, "x")
+    networkx.set_node_attributes(graph, {"gate": 0.0, "roof": 3.0, "lab": 1.0}, "y")
+    netkf.save(run, run.scenario, tmp_path / "run")
+    networkx.write_graphml(graph, tmp_path / "run" / "places.graphml")
+    networkx.write_gml(graph, tmp_path / "run" / "places.gml")
+    tables = [{"kind": end, "path": f"places.{end}"} for end in ("graphml", "gml")]
+    file = tmp_path / "run" / "scenario.toml"
+    given, *read = (
+        netkf.load(file, {"network.lives": [], "network.graph": one}).topology.positions
+        for one in (graph, *tables)
+    )
+    assert given is not None
+    assert read == [given, given]
 
 
 def test_directions_of_a_table_are_links_of_their_own(run):
