@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy
 
+from netkf.algorithms.kernels.riccati import state_units
 from netkf.algorithms.registry import overridden
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, square_root
@@ -45,7 +46,6 @@ from netkf.theory.hybrid.samples import (
 
 EQUAL_RATES = 1e-8  # difference of rates that count as equal, as a share of the largest rate
 RESIDUAL_TOLERANCE = 1e-9  # of the left null vector, relative
-BALANCING_SWEEPS = 200  # at most, of natural units
 
 
 class CoupledRiccati(NamedTuple):
@@ -102,7 +102,7 @@ class CoupledRiccati(NamedTuple):
 
     def in_natural_units(self) -> tuple[CoupledRiccati, FloatArray]:
         """Return the equations of states in natural units, and these (n,); without jumps."""
-        units = natural_units(self.A, self.Q, self.information)
+        units = state_units(self.A, self.Q, self.information)
         covariance, drift = np.outer(units, units), np.outer(1.0 / units, units)
         scaled = self._replace(
             A=self.A * drift,
@@ -118,25 +118,6 @@ class CoupledRiccati(NamedTuple):
     def scale_rates(self, factor: float) -> CoupledRiccati:
         """Return the equations with all link rates multiplied by ``factor``."""
         return self._replace(coupling=factor * self.coupling)
-
-
-def natural_units(A: FloatArray, Q: FloatArray, G: FloatArray) -> FloatArray:
-    """Return powers of 2 (n,): units of states in which a Riccati equation with A, Q and G (n, n)
-    is balanced, so that what is large or small in it does not depend on the units of the plant.
-    """
-    A, Q, G = (np.abs(matrix) for matrix in (A - np.diag(np.diagonal(A)), Q, G))
-    units = np.ones(len(A))
-    for _ in range(BALANCING_SWEEPS):
-        before = units.copy()
-        for i, unit in enumerate(units):
-            # Rates of what the state does, and of what is done to it.
-            acts = unit * (A[:, i] / units + G[i] * units).sum()
-            suffers = (A[i] * units + Q[i] / units).sum() / unit
-            if acts > 0.0 and suffers > 0.0:
-                units[i] = unit * (suffers / acts) ** 0.25
-        if np.abs(np.log2(units / before)).max() < 0.1:
-            break
-    return np.asarray(np.ldexp(1.0, np.round(np.log2(units)).astype(int)))
 
 
 def concerns_hybrid_paper(scenario: Scenario) -> bool:
