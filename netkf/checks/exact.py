@@ -48,7 +48,7 @@ from netkf.laws.intervals import (
     student_interval,
 )
 from netkf.laws.noise import MIN_VARIANCE_SHARE, whiten
-from netkf.linalg.arrays import FloatArray, IntArray, in_units, row_units
+from netkf.linalg.arrays import FloatArray, IntArray, in_own_units, in_units, row_units
 from netkf.scenario.records import nodes_with_law
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.increments import integration_steps
@@ -201,9 +201,8 @@ def _pool_nees(e: FloatArray, P: FloatArray, law: ErrorLaw) -> FloatArray:
 def _nearly_singular(P: FloatArray) -> np.ndarray:
     """Return a mask (K, N) of covariances P (K, N, n, n) that are singular or not finite."""
     finite = np.asarray(np.isfinite(P).all(axis=(-1, -2)))
-    P = np.where(finite[..., None, None], P, 0.0)
-    units = row_units(np.diagonal(P, axis1=-2, axis2=-1))
-    values = np.linalg.eigvalsh(in_units(P, units))
+    scaled, _ = in_own_units(np.where(finite[..., None, None], P, 0.0))
+    values = np.linalg.eigvalsh(scaled)
     return np.asarray(~(values[..., 0] > SINGULAR * values[..., -1]))
 
 
@@ -232,9 +231,8 @@ def whiten_errors(e: FloatArray, stacked: FloatArray, floor: FloatArray | float)
     rounding, ``floor`` (K,) in each row.
     """
     finite = np.asarray(np.isfinite(stacked).all(axis=(-1, -2)))
-    stacked = np.where(finite[:, None, None], stacked, 0.0)
-    units = row_units(np.diagonal(stacked, axis1=1, axis2=2))
-    values, vectors = np.linalg.eigh(in_units(stacked, units))
+    scaled, units = in_own_units(np.where(finite[:, None, None], stacked, 0.0))
+    values, vectors = np.linalg.eigh(scaled)
     rounding = np.reshape(floor, (-1, 1)) * np.square(vectors / units[..., None]).sum(axis=1)
     counted = (values > MIN_VARIANCE * values[:, -1:]) & (values > rounding)
     components = np.einsum("kab,ka->kb", vectors, e.reshape(len(e), -1) / units)
@@ -408,8 +406,8 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
     # Points without exact covariances have no weight, and so are not tested.
     known = np.isfinite(P + Sigma).all(axis=(-1, -2), keepdims=True)
     P, Sigma = np.where(known, P, 0.0), np.where(known, Sigma, 0.0)
-    units = row_units(np.diagonal(P, axis1=-2, axis2=-1))
-    inverse = in_units(np.asarray(np.linalg.pinv(in_units(P, units))), units)
+    scaled, units = in_own_units(P)
+    inverse = in_units(np.asarray(np.linalg.pinv(scaled)), units)
     m = runs.mean[:max_runs]  # the exact mean of the errors
     weights = np.linalg.eigvals(inverse @ Sigma).real
     weights = np.maximum(weights, 0.0).reshape(len(P), -1, n)

@@ -27,7 +27,7 @@ from netkf.checks.samples import RunSamples, check_replay, check_times, sampled_
 from netkf.checks.statistics import affine, eigenvalue_interval
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.laws.intervals import Interval
-from netkf.linalg.arrays import FloatArray, in_units, row_units
+from netkf.linalg.arrays import FloatArray, in_own_units, in_units, row_units
 from netkf.network.clocks import Poisson, Renewal
 from netkf.scenario.scenario import Scenario
 from netkf.theory import (
@@ -115,8 +115,8 @@ def _mean_below_bound(samples: HybridSamples, level: float) -> Finding:
 
 def _relative_excess(P: FloatArray, bound: FloatArray, level: float) -> Interval | None:
     """Return an interval for the largest eigenvalue of E[P] relative to ``bound``, less 1."""
-    units = row_units(np.diagonal(bound))
-    values, vectors = np.linalg.eigh(in_units(bound, units))
+    scaled, units = in_own_units(bound)
+    values, vectors = np.linalg.eigh(scaled)
     if not values[0] > 1e-12 * values[-1]:
         return None
     white = vectors / np.sqrt(values) / units[:, None]
@@ -134,12 +134,12 @@ def _bound_settles(samples: HybridSamples, level: float) -> Finding:
     """Check that the bound on the mean of P, H (12), reaches its steady state."""
     promised = with_promised_filter(samples.scenario)
     steady_bound, distance, factor = steady_covariance_bound(promised), np.inf, 1.0
+    units = row_units(np.diagonal(steady_bound, axis1=1, axis2=2).max(axis=0))
+    size = np.abs(in_units(steady_bound, units)).max()
     while distance > STEADY_TOLERANCE and factor < MAX_TIME:
         factor *= 10.0
         bound = covariance_bound(promised, np.array([factor * samples.scenario.horizon]))[0]
-        units = row_units(np.diagonal(steady_bound, axis1=1, axis2=2).max(axis=0))
-        gap, size = (in_units(np.abs(one), units) for one in (bound - steady_bound, steady_bound))
-        distance = float(gap.max() / size.max())
+        distance = float(np.abs(in_units(bound - steady_bound, units)).max() / size)
     message = (
         f"computed, not simulated: the bound at {factor:g} horizons differs from its steady state "
         f"by {distance:.1e} of the largest entry"
@@ -195,8 +195,8 @@ def _constant_gains_are_worse(samples: HybridSamples, level: float) -> Finding:
 def _mixing_factor(scenario: Scenario) -> float:
     S, slowest = limit_covariance(scenario), _slowest_mixing(coupling(scenario))
     models = {id(model): model for model in scenario.models}.values()  # nodes share them
-    units = row_units(np.diagonal(S))
-    size = np.linalg.norm(in_units(S, units), 2)
+    scaled, units = in_own_units(S)
+    size = np.linalg.norm(scaled, 2)
     speeds = [
         np.linalg.norm(m.A * units / units[:, None], 2)
         + size * np.linalg.norm(units[:, None] * m.H.T @ np.linalg.solve(m.R, m.H * units), 2)

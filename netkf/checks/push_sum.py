@@ -40,7 +40,7 @@ from netkf.checks.samples import (
 from netkf.checks.statistics import affine, quadratic_interval
 from netkf.core.errors import TheoryError
 from netkf.laws.intervals import Interval, deviation_interval
-from netkf.linalg.arrays import FloatArray, in_units, row_units
+from netkf.linalg.arrays import FloatArray, in_own_units
 from netkf.scenario.scenario import Scenario
 from netkf.theory import (
     exact_minimum_gamma,
@@ -78,8 +78,8 @@ class PushSumSamples(RunSamples):
     def standardised(self) -> FloatArray:
         """Errors (R', N, n) at the end, whitened by their exact covariance."""
         Sigma, e = self.runs.Sigma[self.followed, -1], self.runs.e[self.followed, -1]
-        units = row_units(np.diagonal(Sigma, axis1=-2, axis2=-1))
-        values, vectors = np.linalg.eigh(in_units(Sigma, units))
+        scaled, units = in_own_units(Sigma)
+        values, vectors = np.linalg.eigh(scaled)
         # Smaller variances are rounding: they are raised, so that they do not blow up a component.
         floor = MIN_VARIANCE * values[..., -1:]
         components = np.einsum("rnab,rna->rnb", vectors, e / units)
@@ -89,9 +89,8 @@ class PushSumSamples(RunSamples):
     def steady_root(self) -> FloatArray:
         """W (N, n, n) with W S W' = I, S the exact steady covariance of sampled nodes."""
         Sigma = push_sum_error_covariance(with_promised_filter(self.scenario))
-        Sigma = Sigma[sampled_indices(self.scenario)]
-        units = row_units(np.diagonal(Sigma, axis1=-2, axis2=-1))
-        values, vectors = np.linalg.eigh(in_units(Sigma, units))
+        scaled, units = in_own_units(Sigma[sampled_indices(self.scenario)])
+        values, vectors = np.linalg.eigh(scaled)
         white = vectors / units[:, :, None] / np.sqrt(values)[:, None, :]
         return np.asarray(np.swapaxes(white, 1, 2))
 

@@ -25,6 +25,7 @@ __all__ = [
     "block_diagonal",
     "cached_by_entries",
     "enlarged",
+    "in_own_units",
     "in_units",
     "readonly_array",
     "real_numbers",
@@ -117,6 +118,12 @@ def row_units(variances: FloatArray) -> FloatArray:
 def in_units(matrices: FloatArray, units: FloatArray) -> FloatArray:
     """Return covariances ``matrices`` (..., n, n) in ``units`` (..., n) of their rows."""
     return np.asarray(matrices / units[..., :, None] / units[..., None, :])
+
+
+def in_own_units(P: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return covariances P (..., n, n) in the units (..., n) of their own rows, and these."""
+    units = row_units(np.diagonal(P, axis1=-2, axis2=-1))
+    return in_units(P, units), units
 
 
 def is_semidefinite(matrix: FloatArray) -> bool:

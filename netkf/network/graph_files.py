@@ -61,10 +61,9 @@ class GraphFile(Graph):
         except ScenarioError as error:
             rule = f"{self.path.name}: {error.rule}"
             raise ScenarioError("path", rule, error.value, error.remedy) from None
-        topology, points = table.topology(self.minimum, self.positions), None
-        if self.positions is None:
-            points = _positions(graph.nodes.values())
-        if points is None:
+        topology = table.topology(self.minimum, self.positions)
+        points = _positions(graph.nodes.values())
+        if points is None or self.positions is not None:
             return topology
         ids = assign_ids(graph.nodes).values()
         places = dict(zip(ids, map(tuple, points.tolist()), strict=True))

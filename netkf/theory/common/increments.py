@@ -148,8 +148,7 @@ def increment_flows(
             flows[key] = _error_flow((A, B), plant, observation, pace, follows)
     groups = [(flows[key], np.array(members[key])) for key in flows]
     reading = [h for indices in members.values() for h in indices]
-    first = observations[reading[0]]
-    units = state_units(A, Q, first.H.T @ np.linalg.solve(first.R, first.H))
+    units = groups[0][0].units[: len(A)]
     return IncrementFlows(groups, reading, StateFlow(*plant, units), follows, scenario.surprise)
 
 

@@ -62,8 +62,8 @@ class ErrorFlow:
         """Take A (n, n), B (n, m), H (p, n) and R (p, p) as the filters assume them, a root
         ``noise`` (p, p) of the true R, and the true B of the ``plant``; A is the true one.
         """
-        self._units = units[:, None]
-        A, B, H, plant = A * units / self._units, B / self._units, H * units, plant / self._units
+        self.units, rows = units, units[:, None]
+        A, B, H, plant = A * units / rows, B / rows, H * units, plant / rows
         root_R, weight = np.linalg.cholesky(R), np.linalg.solve(R, H).T
         self._H = np.linalg.solve(root_R, H)
         # What enters errors by X' and Y': noises as filters assume them, and true ones.
@@ -97,8 +97,9 @@ class ErrorFlow:
         of the plant's 8 m inputs, and the first of n inputs of each error.
         """
         n, weights = errors.shape[1], np.sqrt(WEIGHTS * gap)[:, None, None]
-        errors /= self._units
-        roots /= self._units
+        rows = self.units[:, None]
+        errors /= rows
+        roots /= rows
         upper, lower, F, Gamma, start = self._over(gap)
         # L L' = I + S' G S, so that J = (I + P G)^-1 = I - S (L L')^-1 S' G and S L^-T is a root of
         # J P.
@@ -117,8 +118,8 @@ class ErrorFlow:
         for e, own in enumerate(_narrowed(_side_by_side(noises[..., self._m :]))):
             first = columns[1] + e * n
             errors[e, :, first : first + own.shape[1]] += own
-        errors *= self._units
-        roots *= self._units
+        errors *= rows
+        roots *= rows
 
 
 def _side_by_side(parts: FloatArray) -> FloatArray:
