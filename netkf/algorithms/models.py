@@ -19,7 +19,7 @@ import numpy as np
 
 from netkf.algorithms.kernels.estimates import transform_root, update_by_row
 from netkf.algorithms.kernels.gains import GainTable, gain_table
-from netkf.algorithms.kernels.maps import MapTables, move_estimate, spread_of
+from netkf.algorithms.kernels.maps import MapTables, move_estimate, settle_root, spread_of
 from netkf.algorithms.kernels.rates import DIFFERENCE, RateTables, move_by_rate, scratch_of_rates
 from netkf.algorithms.kernels.root_flow import FlowTable, flow_root, flow_table, gain_update_root
 from netkf.algorithms.kernels.run import CLOSE, longest_interval
@@ -459,6 +459,14 @@ def lower(root: FloatArray) -> FloatArray:
     """
     S = as_floats(root)
     return lower_root(S) if np.triu(S, 1).any() else S
+
+
+def root_of_points(root: FloatArray) -> FloatArray:
+    """Return the lower triangular root (n, n) of ``root root'`` that sigma points go along."""
+    n = len(root)
+    S = np.array(lower(root)).reshape(1, n, n, 1)
+    settle_root(S, 0, 0, n)
+    return S.reshape(n, n)
 
 
 def as_floats(values: Any) -> FloatArray:

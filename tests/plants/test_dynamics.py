@@ -271,6 +271,37 @@ def test_sigma_points_are_those_of_the_papers(pair, method, engine):
         np.testing.assert_allclose(run.P[k, 0], P, atol=1e-10)
 
 
+@pytest.mark.parametrize("method", ["ukf", "ckf"])
+def test_sigma_points_of_a_singular_covariance(tmp_path, method):
+    """Those of the Cholesky factor, where a state is known and others follow it."""
+    F, R, anchor = np.array([[1.0, 0.0, 0.1], [0.0, 1.0, 0.0], [-0.1, 0.3, 1.0]]), 0.01, [-0.3, 0.1]
+    rows = "".join(f"{k}.0,0,{1.0 + 0.1 * k}\n" for k in range(1, 5))
+    (tmp_path / "y.csv").write_text(f"t,node,y0\n{rows}")
+    mean, P = np.array([1.0, 0.5, 0.3]), np.array([[0.5, 0, 0.2], [0, 0, 0], [0.2, 0, 0.3]])
+    plant = {"kind": "linear", "F": F.tolist(), "Q": np.zeros((3, 3)).tolist(), "period": 1.0}
+    sensor = {"kind": "range", "path": "y.csv", "positions": [anchor], "states": [1, 2]}
+    table = {
+        "format": 1, "name": "known", "horizon": 5.0, "probe": 1.0,
+        "plant": plant | {"mean": mean.tolist(), "cov": P.tolist()},
+        "sensors": [sensor | {"R": [[R]]}],
+        "network": {"graph": {"kind": "edges", "edges": [], "nodes": 1}},
+        "filter": {"kind": "local", "linearise": method},
+    }  # fmt: skip
+    runs = [netkf.simulate(from_table(table, tmp_path), engine=engine) for engine in ENGINES]
+    for k in range(1, 5):
+        mean, P = F @ mean, F @ P @ F.T
+        points, wm, wc = sigma_points(mean, P + 1e-14 * np.eye(3), method)
+        expected, S, deviations = moments(
+            points, wm, wc, lambda p: np.array([math.hypot(*(p[1:] - anchor))])
+        )
+        cross = (wc[:, None] * (np.array(points) - mean)).T @ deviations
+        K = cross / (S + R)
+        mean, P = mean + K @ (1.0 + 0.1 * k - expected), P - K @ (S + R) @ K.T
+        for run in runs:
+            np.testing.assert_allclose(run.xhat[k, 0], mean, atol=1e-9)
+            np.testing.assert_allclose(run.P[k, 0], P, atol=1e-9)
+
+
 MODULE = """
 import math
 import numpy as np

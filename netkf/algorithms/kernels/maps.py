@@ -34,6 +34,9 @@ from netkf.linalg.structs import Size, Struct
 METHODS = ("ekf", "ukf", "ckf")
 """How functions that are not linear are used: linearised, or by unscented or cubature points."""
 
+ROUNDING = 1e-14
+"""Share of a row of a root below which its pivot is rounding: the state follows from others."""
+
 
 class Spread(NamedTuple):
     """Sigma points of n states and their weights.
@@ -161,6 +164,7 @@ def _move_points(
     model: MapTables, x: FloatArray, root: FloatArray, k: int, q: int, slot: int, root_Q: FloatArray
 ) -> None:
     n, points, work = len(model.x), model.points, model.work
+    settle_root(root, k, q, n)
     for r in range(2 * n + 1):
         set_point(x, root, k, q, model.distance, r, model.x)
         call_function(
@@ -208,6 +212,27 @@ def write_root(work: FloatArray, root: FloatArray, q: int) -> None:
         sign = -1.0 if work[j, j] < 0.0 else 1.0
         for i in range(j, n):
             root[i, j, q] = sign * work[i, j]
+
+
+@kernel
+def settle_root(root: FloatArray, k: int, q: int, n: int) -> None:
+    """Make columns of the first ``n`` states of ``root[k]`` without a pivot 0, by rotations with
+    later ones: sigma points are those of the Cholesky factor also where P is singular.
+    """
+    for j in range(n):
+        square = 0.0
+        for m in range(j + 1):
+            square += root[k, j, m, q] * root[k, j, m, q]
+        if root[k, j, j, q] > ROUNDING * math.sqrt(square):
+            continue
+        root[k, j, j, q] = 0.0
+        for i in range(j + 1, n):
+            pivot, other = root[k, i, i, q], root[k, i, j, q]
+            length = math.hypot(pivot, other)
+            for r in range(i, n if other != 0.0 else i):
+                a, b = root[k, r, i, q], root[k, r, j, q]
+                root[k, r, i, q] = (pivot * a + other * b) / length
+                root[k, r, j, q] = (pivot * b - other * a) / length
 
 
 @kernel

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.kernels.maps import set_point
+from netkf.algorithms.kernels.maps import set_point, settle_root
 from netkf.algorithms.kernels.run import Estimates
 from netkf.linalg.addresses import reads_only
 from netkf.linalg.arrays import FloatArray
@@ -258,6 +258,7 @@ def _use_points(
     own, slot = min(f, len(rows.count) - 1), min(s, len(rows.origin) - 1)
     n, p, points = rows.count[own], rows.kind.shape[1], rows.points
     distance, weight = rows.distance[own], rows.weight[own]
+    settle_root(record.root, h, q, n)
     for k in range(1, 2 * n + 1):
         set_point(record.xhat, record.root, h, q, distance, k, rows.x[:n])
         for j in range(n):

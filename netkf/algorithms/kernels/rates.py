@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.kernels.maps import set_point, weigh_points, write_root
+from netkf.algorithms.kernels.maps import set_point, settle_root, weigh_points, write_root
 from netkf.algorithms.kernels.run import (
     SlotRun,
     carry,
@@ -153,6 +153,8 @@ def _move(
 ) -> None:
     state, work, points = model.state, model.work, model.points
     size, second = n + 2 * n * n, n + n * n
+    if model.distance > 0.0:
+        settle_root(root, k, 0, n)
     for r in range(2 * n + 1 if model.distance > 0.0 else 0):
         set_point(x, root, k, 0, model.distance, r, model.slope)
         for i in range(n):

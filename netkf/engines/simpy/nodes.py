@@ -23,7 +23,13 @@ from netkf.algorithms.filter import (
 from netkf.algorithms.gates import Gate
 from netkf.algorithms.kernels.maps import Spread
 from netkf.algorithms.kernels.run import interval_end
-from netkf.algorithms.models import ChangingFlowModel, MapModel, RateModel, first_root
+from netkf.algorithms.models import (
+    ChangingFlowModel,
+    MapModel,
+    RateModel,
+    first_root,
+    root_of_points,
+)
 from netkf.algorithms.single import Payload
 from netkf.algorithms.translation import Common, state_before
 from netkf.core.places import Place
@@ -318,7 +324,7 @@ class Node:
         # All together: deviations of functions of one state are correlated.
         y = np.concatenate([y for y, *_ in functions])
         stacked = Stacked([h for _, h, _ in functions])
-        y, H, extra = linearise_by_points(stacked, y, xhat, root, self._points)
+        y, H, extra = linearise_by_points(stacked, y, xhat, root_of_points(root), self._points)
         is_linear = [isinstance(H, np.ndarray) for _, H, _ in samples]
         parts = [sample for sample, linear in zip(samples, is_linear, strict=True) if linear]
         parts.append((y, H, block_diagonal([R for *_, R in functions]) + extra))
