@@ -173,13 +173,15 @@ def add_sums(size: Size, s: ReducedSamples, r: int, t: int, count: int) -> None:
     P, error, nees, averages = s.P[r], s.error[r], s.nees[r], s.averages
     begin, errors_end, P_end = s.spans[r, 0], s.spans[r, 1], s.spans[r, 2]
     filters = averages.shape[1]
-    for q in range(max(t, begin), min(t + count, max(errors_end, P_end))):
-        for f in range(filters):
-            k = q * filters + f
+    first, last = max(t, begin), t + count
+    for f in range(filters):
+        # Local numbers: sums in memory would wait for each other.
+        squares, variances, nees_sum = averages[r, f, 0], averages[r, f, 1], averages[r, f, 2]
+        for k in range(first * filters + f, min(last, errors_end) * filters, filters):
             for i in range(len(size)):
-                if q < errors_end:
-                    averages[r, f, 0] += error[k, i] * error[k, i]
-                if q < P_end:
-                    averages[r, f, 1] += P[k, i, i]
-            if q < errors_end:
-                averages[r, f, 2] += nees[k]
+                squares += error[k, i] * error[k, i]
+            nees_sum += nees[k]
+        for k in range(first * filters + f, min(last, P_end) * filters, filters):
+            for i in range(len(size)):
+                variances += P[k, i, i]
+        averages[r, f, 0], averages[r, f, 1], averages[r, f, 2] = squares, variances, nees_sum

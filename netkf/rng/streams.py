@@ -66,7 +66,8 @@ class Streams:
         ids = _ids_in_counter(tuple(entities)) if entities else None
         if ids is not None and replicas[-1] < WORD:
             states[:, :, KEY:BUFFER], states[:, :, 1:3] = _key(self.seed), ids
-            states[:, :, 3] = (code << 32) + np.array(replicas, dtype=np.uint64)[:, None]
+            numbers = np.arange(replicas.start, replicas.stop, dtype=np.uint64)
+            states[:, :, 3] = (code << 32) + numbers[:, None]
         else:
             for run, replica in zip(states, replicas, strict=True):
                 for state, entity in zip(run, entities, strict=True):

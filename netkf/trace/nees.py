@@ -176,8 +176,8 @@ def find_blurred(
                     unknown = unknown or np.isnan(P[r, t, f, i, i])
             if unknown:
                 variance = variance_of_errors(P, e, r, t)
-            deviation = np.sqrt(max(variance, 0.0)) / BLUR
-            if deviation > 0.0 and ROUNDING * largest > deviation:
+            rounding = ROUNDING * BLUR * largest
+            if 0.0 < variance < rounding * rounding:
                 first[r] = times[t]
                 break
 

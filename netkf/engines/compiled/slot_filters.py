@@ -39,6 +39,8 @@ _UNDECIDED: dict[str, Any] = {
     "clipped": np.zeros((0,) * 5, dtype=np.int32),
 }
 """Fields of a plan without gates whose messages are exact."""
+HELD = 128
+"""Numbers of P that are held until they are written together."""
 _KINDS = {"predict": PREDICT, "sense": SENSE, "exchange": EXCHANGE}
 
 
@@ -77,12 +79,17 @@ class SlotFilters:
         memories = [model.memory for model in self._models] if setup.own_models else []
         # None where the model of the run is that of all filters.
         self._memories = np.array(memories, dtype=np.int64).reshape(-1, words)
-        # L entries are copied at a time, so that the last copy may go beyond the last entry.
-        for_means, for_roots = H * n + LANES, H * n * n + LANES
-        self.sample_scratch = {
+        # Small samples are written many at a time. L entries are copied at once, so that the last
+        # copy may go beyond the last entry.
+        room = max(1, HELD // (H * n * n))
+        for_means, for_roots = room * H * n + LANES, room * H * n * n + LANES
+        self.sample_scratch: dict[str, Any] = {
             "sampled_xhat": aligned((for_means, LANES)),
             "sampled_error": aligned((for_means, LANES)),
             "sampled_P": aligned((for_roots, LANES)),
+            "room": room,
+            "first": 0,
+            "held": 0,
             "runs": np.zeros(LANES, dtype=np.int64),
         }
         self._lay_out_stages()

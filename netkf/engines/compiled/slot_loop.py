@@ -98,7 +98,9 @@ class SlotSamples(Struct):
                       relative to the moving origin that estimates refer to
     framed : whether the origin moves; otherwise both are the same
     total : (B, L), sum of all samples of xhat and P so far: finite if all of them are
-    sampled_xhat, sampled_error, sampled_P : (>= H w, L), (>= H w, L) and (>= H w w, L), a sample
+    sampled_xhat, sampled_error, sampled_P : (>= K H w, L), (>= K H w, L) and (>= K H w w, L), last
+                                             samples of a block, at most K = ``room``
+    first, held : the number of the first of these, and how many there are
     runs : (L,), the run of each lane, -1 if it is idle
     entries : (H, w), the entries of the state that each filter estimates, and any beyond; (0, 0)
               if all estimate all
@@ -115,6 +117,9 @@ class SlotSamples(Struct):
     sampled_xhat: FloatArray
     sampled_error: FloatArray
     sampled_P: FloatArray
+    room: int
+    first: int
+    held: int
     runs: np.ndarray
     entries: np.ndarray
 
@@ -192,6 +197,7 @@ def slot_loop(
             simulate_slot(block, run, plan, verbs, b, s)
             if plan.predicts == 0 and plan.stop == WHOLE:
                 sample_slot(block, run, plan, samples, verbs, b, s)
+        write_held_samples(run.lanes, samples, b)
 
 
 @kernel
@@ -355,46 +361,63 @@ def write_slot_sample(
 ) -> None:  # fmt: skip
     """Write the sample of slot ``s`` of block ``b``: ``xhat`` (H, n, L), ``root`` (H, n, n, L)."""
     k, lanes, entries = plan.sample[s], run.lanes, samples.entries
-    n, first = len(run.size), b * len(lanes)
+    n, count = len(run.size), len(xhat)
     all_local, all_absolute = samples.local, samples.absolute
     means, errors, covariances = samples.sampled_xhat, samples.sampled_error, samples.sampled_P
     sum_of_all = load(lanes, samples.total, b)
-    states, framed = all_absolute.shape[2], samples.framed
-    for h in range(len(xhat)):
+    framed, first = samples.framed, samples.held * count
+    for f in range(first, first + count):
+        h = f - first
         for i in range(n):
             entry = entries[h, i] if len(entries) > 0 else i
             x = load(lanes, xhat, h, i)
             # Relative to the moving origin: a difference of large absolute states loses digits.
             local = load(lanes, all_local, b, s, entry)
-            store(lanes, errors, h * n + i, local - x)
+            store(lanes, errors, f * n + i, local - x)
             if framed:
                 x += load(lanes, all_absolute, b, s, entry) - local
-            store(lanes, means, h * n + i, x)
+            store(lanes, means, f * n + i, x)
             sum_of_all += x
             # P = S S' and its mirror image, because samples hold covariances.
             for j in range(i + 1):
                 total = spread(lanes, 0.0)
                 for m in range(j + 1):
                     total += load(lanes, root, h, i, m) * load(lanes, root, h, j, m)
-                store(lanes, covariances, (h * n + i) * n + j, total)
-                store(lanes, covariances, (h * n + j) * n + i, total)
+                store(lanes, covariances, (f * n + i) * n + j, total)
+                store(lanes, covariances, (f * n + j) * n + i, total)
                 sum_of_all += total
     store(lanes, samples.total, b, sum_of_all)
-    runs, x_of_runs = samples.runs, samples.x
-    for q in range(len(lanes)):
-        # The last block may have more lanes than there are runs left.
-        used = first + q < len(x_of_runs)
-        runs[q] = first + q if used else -1
-        for i in range(states if used else 0):
-            x_of_runs[first + q, k, i] = all_absolute[b, s, i, q]
-    scatter_sample(lanes, means, samples.xhat[:, k], runs)
-    scatter_sample(lanes, errors, samples.error[:, k], runs)
-    scatter_sample(lanes, covariances, samples.P[:, k], runs)
+    for q in range(min(len(lanes), len(samples.x) - b * len(lanes))):
+        for i in range(all_absolute.shape[2]):
+            samples.x[b * len(lanes) + q, k, i] = all_absolute[b, s, i, q]
+    if samples.held == 0:
+        samples.first = k
+    samples.held += 1
+    if samples.held == samples.room:
+        write_held_samples(lanes, samples, b)
 
 
 @kernel
-def scatter_sample(lanes: Lanes, values: FloatArray, out: FloatArray, indices: np.ndarray) -> None:
-    """Write ``values`` (>= C, L) into ``out`` (R, C): lane q at ``indices[q]``, -1: nowhere."""
-    count = out.shape[1]
+def write_held_samples(lanes: Lanes, samples: SlotSamples, b: int) -> None:
+    """Write the samples of block ``b`` that are held: many fill the registers that transpose."""
+    if samples.held == 0:
+        return
+    for q in range(len(lanes)):
+        # The last block may have more lanes than there are runs left.
+        r = b * len(lanes) + q
+        samples.runs[q] = r if r < len(samples.x) else -1
+    scatter_samples(lanes, samples.sampled_xhat, samples.xhat, samples)
+    scatter_samples(lanes, samples.sampled_error, samples.error, samples)
+    scatter_samples(lanes, samples.sampled_P, samples.P, samples)
+    samples.held = 0
+
+
+@kernel
+def scatter_samples(
+    lanes: Lanes, values: FloatArray, out: FloatArray, samples: SlotSamples
+) -> None:
+    """Write held ``values`` (>= K C, L) into ``out`` (R, T, C)."""
+    count = samples.held * out.shape[2]
+    behind = out[:, samples.first :]
     for c in range(0, count, len(lanes)):
-        scatter(lanes, values, c, out, indices, min(count - c, len(lanes)))
+        scatter(lanes, values, c, behind, samples.runs, min(count - c, len(lanes)))

@@ -270,7 +270,7 @@ def _no_samples(local: FloatArray, blocks: int, filters: SlotFilters) -> SlotSam
     """Return room for no sample, with the true states (B, 1, n, L) of the slot."""
     nothing = np.zeros((1, 0, 1))
     return SlotSamples(
-        **dict.fromkeys(("x", "xhat", "P", "error"), nothing), absolute=local, local=local,
+        x=nothing, xhat=nothing, P=nothing, error=nothing, absolute=local, local=local,
         framed=False, total=np.zeros((blocks, LANES)), **filters.sample_scratch,
         entries=np.zeros((0, 0), dtype=np.int64),
     )  # fmt: skip
