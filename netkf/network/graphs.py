@@ -480,6 +480,7 @@ class Edges(Graph):
         delivery = self._delivery(links)
         if not self.directed:
             links = [(min(link), max(link)) for link in links]
+        _check_size(len(set(ids.values())), len(set(links)))
         repeated = len(links) - len(set(links))
         notes = (f"edges: {repeated} of {len(links)} pairs are listed again",) if repeated else ()
         return Topology(

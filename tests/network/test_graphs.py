@@ -111,3 +111,8 @@ def test_intel_lab_network():
         min(topology.delivery[i, j], topology.delivery[j, i]) >= 0.25 for i, j in topology.links
     )
     assert topology.positions[16] == (1.5, 2.0)
+
+
+def test_what_is_listed_has_the_limits_of_what_is_drawn():
+    with pytest.raises(ScenarioError, match="must have at most 200,000 nodes"):
+        graphs.Edges(edges=[(k, k + 1) for k in range(200_000)]).build(0)
