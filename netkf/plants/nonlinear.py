@@ -85,7 +85,7 @@ class Linearised:
         """Return the innovation (p,): a reading y (p,) minus the ``expected`` one (p,)."""
         both = np.zeros((2, len(self._present)))
         both[:, self._present] = y, expected
-        return np.asarray(self._sensor.difference(*both)[self._present])
+        return np.asarray(difference_of(self._sensor, *both)[self._present])
 
 
 def linearise_by_points(
@@ -244,12 +244,30 @@ def _result_of(
     if is_netkf_class(type(sensor)):
         return np.asarray(getattr(sensor, method)(x, node), dtype=np.float64)
     given = getattr(sensor, method)(x.copy(), node)
+    # Of a state that has left the numbers nobody can know the reading.
+    return _numbers_of(given, method, shape, bool(np.isfinite(x).all()), f"at x = {quote(x)}")
+
+
+def difference_of(sensor: NonlinearSensor, y: FloatArray, expected: FloatArray) -> FloatArray:
+    """Return the innovation (p,) of a reading y (p,), nan where one of both is, see
+    ``reading_of``.
+    """
+    if is_netkf_class(type(sensor)):
+        return np.asarray(sensor.difference(y, expected))
+    known = np.isfinite(y) & np.isfinite(expected)
+    y, expected = np.where(known, y, 0.0), np.where(known, expected, 0.0)
+    given, where = sensor.difference(y.copy(), expected.copy()), f"of {quote(y)}, {quote(expected)}"
+    return np.where(known, _numbers_of(given, "difference", y.shape, True, where), np.nan)
+
+
+def _numbers_of(
+    given: Any, method: str, shape: tuple[int, ...], is_finite: bool, where: str
+) -> FloatArray:
     result = np.asarray(given)
     is_right = result.dtype.kind in "fiu" and result.shape == shape
-    # Of a state that has left the numbers nobody can know the reading.
-    if not is_right or (np.isfinite(x).all() and not np.isfinite(result).all()):
+    if not is_right or (is_finite and not np.isfinite(result).all()):
         rule = f"{method} must return finite numbers of the shape {shape}, not {quote(given)}"
-        raise ValueError(f"{rule}, at x = {quote(x)}")
+        raise ValueError(f"{rule}, {where}")
     return result.astype(np.float64)
 
 

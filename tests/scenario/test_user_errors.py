@@ -143,6 +143,10 @@ MISTAKES = {
                                     r"jacobian must return finite numbers of the shape \(1, 1\), not \[\[1\.0, 1\.0\]\]"),
     "a complex h": ("SENSOR", "def h(self, x, node): return x + 1j\n"
                     "def jacobian(self, x, node): return np.eye(1)", r"h must return finite numbers .* at x = \["),
+    "a difference that is nan": ("SENSOR", "def h(self, x, node): return x\n"
+                                 "def jacobian(self, x, node): return np.eye(1)\n"
+                                 "def difference(self, y, expected): return y * np.nan",
+                                 r"F failed after difference .* difference must return finite numbers of the shape \(1,\), not \[nan\]"),
     "a sensor defines half": ("SENSOR", "def h(self, x, node): return x", "must define jacobian"),
     "a sensor defines nothing": ("SENSOR", "pass", "must define h, jacobian"),
     "build returns nothing": ("GRAPH", "def build(self, seed): pass",

@@ -18,7 +18,13 @@ from netkf.algorithms.kernels.nonlinear_rows import (
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.vector_functions import VectorFunction
-from netkf.plants.nonlinear import NonlinearSensor, PositionedSensor, jacobian_of, reading_of
+from netkf.plants.nonlinear import (
+    NonlinearSensor,
+    PositionedSensor,
+    difference_of,
+    jacobian_of,
+    reading_of,
+)
 from netkf.plants.relative import RelativePositionSensor
 
 
@@ -134,7 +140,7 @@ def _functions_of(
         return own
 
     def difference(y: FloatArray, expected: FloatArray, _: float) -> Any:
-        return sensor.difference(y, expected)
+        return difference_of(sensor, y, expected)
 
     shapes = ((n,), (0,), (p,)), ((n,), (0,), (p, n)), ((p,), (p,), (p,))
     functions = zip((h, jacobian, difference), shapes, strict=True)
