@@ -95,13 +95,27 @@ def _detections(run: Run, start: datetime.datetime | None) -> set[Any]:
         )
         detections.add(
             detection(
-                y,
+                _with_angles(y[:, None], one.H),
                 timestamp=_stamp(float(found.times[one.number]), start),
                 measurement_model=model,
                 metadata={"node": one.node, "sensor": one.placed.ordinal},
             )
         )
     return detections
+
+
+def _with_angles(y: FloatArray, H: Any) -> Any:
+    """Return readings (p, k) with angles of Stone Soup, which subtracts and averages them as such:
+    where H is a function that finds no difference between readings a turn apart.
+    """
+    if isinstance(H, np.ndarray):
+        return y
+    turns = 2.0 * np.pi * np.eye(len(y))
+    angles = [abs(H.difference(one, 0.0 * one)[k]) < 1.0 for k, one in enumerate(turns)]
+    marked = y.astype(object if any(angles) else float)
+    for k in np.flatnonzero(angles):
+        marked[k] = [_import("types.angle").Bearing(value) for value in y[k]]
+    return marked
 
 
 @cache
@@ -130,7 +144,7 @@ def _model_class() -> Any:
             y = H @ xs if is_linear else np.column_stack([H.value(x) for x in (xs - self.origin).T])
             drawn = self.rvs(num_samples=xs.shape[1]) if noise is True else noise
             cls = types.StateVector if y.shape[1] == 1 else types.StateVectors
-            return cls(y) + (0 if drawn is False or drawn is None else drawn)
+            return cls(_with_angles(y, H)) + (0 if drawn is False or drawn is None else drawn)
 
         def jacobian(self, state: Any, **_: Any) -> FloatArray:
             if isinstance(self.reading, np.ndarray):

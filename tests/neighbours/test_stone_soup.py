@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import netkf
+from netkf.scenario.reading import from_table
 from tests.conftest import SCENARIOS
 
 pytest.importorskip("stonesoup")
@@ -16,7 +17,11 @@ from stonesoup.models.transition.linear import LinearGaussianTimeInvariantTransi
 from stonesoup.predictor.kalman import KalmanPredictor
 from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.state import GaussianState
-from stonesoup.updater.kalman import ExtendedKalmanUpdater, KalmanUpdater
+from stonesoup.updater.kalman import (
+    ExtendedKalmanUpdater,
+    KalmanUpdater,
+    UnscentedKalmanUpdater,
+)
 
 
 def test_ospa_of_a_track_is_the_error_of_its_node(run):
@@ -122,6 +127,40 @@ def test_nonlinear_detections_have_the_jacobian_of_their_sensor():
     J, R = numeric, model.covar()
     expected = np.linalg.inv(np.eye(len(x)) + J.T @ np.linalg.inv(R) @ J)
     np.testing.assert_allclose(posterior.covar.astype(float), expected, atol=1e-6)
+
+
+def test_directions_are_angles_of_stone_soup(tmp_path):
+    """Its unscented filter, whose points lie on both sides of half a turn, has the node's track."""
+    table = {
+        "format": 1, "name": "behind", "horizon": 9.0, "probe": 1.0, "seed": 2,
+        "plant": {
+            "kind": "linear", "F": np.eye(2).tolist(), "Q": np.diag([0.02, 0.3]).tolist(),
+            "period": 1.0, "mean": [-4.0, 0.0], "cov": [[0.2, 0.0], [0.0, 0.2]],
+        },
+        "sensors": [
+            {
+                "kind": "range-bearing", "nodes": [0], "positions": [[0.0, 0.0]],
+                "R": [[0.04, 0.0], [0.0, 0.01]],
+            }
+        ],
+        "network": {"graph": {"kind": "edges", "edges": [], "nodes": 1}},
+        "filter": {"kind": "local", "linearise": "ukf"},
+    }  # fmt: skip
+    scenario = from_table(table, tmp_path)
+    found, plant = netkf.simulate(scenario, engine="simpy").to_stonesoup(), scenario.plant
+    model = LinearGaussianTimeInvariantTransitionModel(
+        transition_matrix=plant.F, covariance_matrix=plant.Q
+    )
+    predictor, updater = KalmanPredictor(model), UnscentedKalmanUpdater(alpha=1, beta=2, kappa=0)
+    (track,), at = found.tracks, {d.timestamp: d for d in found.detections}
+    state = GaussianState(plant.start_mean, plant.start_cov, timestamp=track[0].timestamp)
+    for theirs in track[1:-1]:
+        prediction = predictor.predict(state, timestamp=theirs.timestamp)
+        state = updater.update(SingleHypothesis(prediction, at[theirs.timestamp]))
+        # Stone Soup averages angles on the circle, which is not quite their mean.
+        mean, covar = state.mean.astype(float), state.covar.astype(float)
+        np.testing.assert_allclose(theirs.mean.astype(float), mean, atol=2e-3)
+        np.testing.assert_allclose(theirs.covar.astype(float), covar, atol=2e-3)
 
 
 def test_blocks_are_paths_of_their_own():
