@@ -56,11 +56,14 @@ EXPORTED = "# netkf: "  # the log of a run begins so
 
 
 class _Rows(NamedTuple):
-    """Rows with ``where`` (file, line), ``what`` ("tx", "rx", "outcome") and heard (1, 0, nan)."""
+    """Rows with ``where`` (file, line), ``what`` ("tx", "rx", "outcome") and heard (1, 0, nan);
+    ``told_by`` is the column of arrivals, "" if another one says what was heard.
+    """
 
     table: pd.DataFrame
     stamps: list[Decimal]
     arrivals: list[Decimal | None]
+    told_by: str
 
 
 def read_tables(log: Path, columns: Mapping[str, str]) -> packets.PacketLog:
@@ -70,6 +73,7 @@ def read_tables(log: Path, columns: Mapping[str, str]) -> packets.PacketLog:
     notes: list[str] = []
     tables = _rename({path: packets.read_text_rows(path) for path in _packet_paths(log)}, columns)
     parts = [_read_rows(path, raw, notes) for path, raw in tables.items()]
+    _mark_lost(parts, notes)
     stamps = [stamp for part in parts for stamp in part.stamps]
     arrivals = [arrival for part in parts for arrival in part.arrivals]
     extras = {name: find_extra(log, name) for name in EXTRAS}
@@ -87,9 +91,9 @@ def read_tables(log: Path, columns: Mapping[str, str]) -> packets.PacketLog:
     table["delay"] = [np.nan if b is None else float(b - a) for a, b in pairs]
     early = np.flatnonzero(table["delay"] < 0.0)
     if early.size:
-        where = table["where"].iloc[early[0]]
-        rule = f"{where}: is heard before it is sent"
-        raise ScenarioError(str(log), rule, None, "correct the stamps; lost packets have none")
+        where, late = table["where"].iloc[early[0]], table["delay"].iloc[early[0]]
+        rule, remedy = "is heard before it is sent", "correct the stamps; lost packets have none"
+        raise ScenarioError(str(log), f"{where}: {rule}", f"{late:g} s after that", remedy)
     # All messages of an exported run are there: a link that is down has none.
     is_export = is_run and _is_export(log / "packets.csv")
     sends, outcomes = _match(table, resolution, notes, str(log), is_export)
@@ -196,15 +200,25 @@ def _read_rows(path: Path, raw: pd.DataFrame, notes: list[str]) -> _Rows:
     table["what"], table["heard"] = _read_outcomes(path, raw, names, table)
     stamps = packets.parse_stamps(path, raw, names["t"], notes)
     arrivals = _read_arrivals(path, raw, names)
-    has_receiver = (table["receiver"] != "").to_numpy()
-    is_lost = has_receiver & np.array([arrival is None for arrival in arrivals])
-    tells = names["t_heard"] and not (names["heard"] or names["event"])
-    if tells and is_lost.any() and not is_lost.all():
+    told_by = "" if names["heard"] or names["event"] else names["t_heard"]
+    return _Rows(table, stamps, arrivals, told_by)
+
+
+def _mark_lost(parts: list[_Rows], notes: list[str]) -> None:
+    """Take rows without a time of arrival for lost messages, where any row of the log has one."""
+    is_known = any(a is not None for part in parts if part.told_by for a in part.arrivals)
+    for table, _, arrivals, column in parts:
+        has_receiver = (table["receiver"] != "").to_numpy()
+        is_lost = has_receiver & np.array([arrival is None for arrival in arrivals])
+        if not column or not is_lost.any():
+            continue
+        if not is_known:
+            notes.append(f"used: {column} is empty: it tells nothing")
+            continue
         # The log has a row for each message, with a time if it arrived.
         table["what"] = np.where(has_receiver, "outcome", "tx")
         table.loc[is_lost, "heard"] = 0.0
-        notes.append(f"used: rows without {names['t_heard']}, lost: {is_lost.sum():,}")
-    return _Rows(table, stamps, arrivals)
+        notes.append(f"used: rows without {column}, lost: {is_lost.sum():,}")
 
 
 def _find_columns(path: Path, raw: pd.DataFrame, notes: list[str]) -> dict[str, str]:

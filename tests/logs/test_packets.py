@@ -959,6 +959,15 @@ def test_a_column_of_arrivals_may_be_empty(tmp_path):
         assert (tmp_path / "one" / name).read_text() == (tmp_path / "other" / name).read_text()
 
 
+def test_a_column_of_arrivals_that_is_empty_in_one_file_tells_losses(tmp_path):
+    (tmp_path / "log").mkdir()
+    first, second = "t,src,dst,seq,arrival\n1.0,a,b,0,1.5\n", "t,src,dst,seq,arrival\n2.0,a,b,1,\n"
+    write(tmp_path / "log" / "one.csv", first.splitlines())
+    write(tmp_path / "log" / "two.csv", second.splitlines())
+    netkf.import_log(tmp_path / "log", "csv", tmp_path / "out")
+    assert table(tmp_path / "out", "outcomes.csv")["delivered"].tolist() == [1, 0]
+
+
 def test_stamps_of_no_plausible_unit_are_refused(tmp_path):
     log = write(tmp_path / "log.csv", ["t,src,dst", "50000000000000,a,b"])
     with pytest.raises(ScenarioError, match=r"line 2: t is too large for seconds.*t_ns=t"):
