@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -42,6 +42,7 @@ from netkf.engines.compiled.state import (
     PathBlock,
     SampleBuffer,
     Scratch,
+    Sensing,
     Simulation,
     TickArrays,
     add_messages,
@@ -56,7 +57,7 @@ from netkf.engines.compiled.visits import Visits, empty_visits
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.lanes import with_spare
 from netkf.linalg.structs import sized
-from netkf.network.node_clocks import node_times
+from netkf.network.node_clocks import NodeTime, node_times
 from netkf.plants.driven import DrivenTruth
 from netkf.plants.paths import BLOCK
 from netkf.rng.streams import Streams
@@ -78,6 +79,34 @@ AT_START = (
     *("receivers", "absorbing", "clipped", "samples"),
 )
 """Integer fields of a Simulation that are 0 when a run begins."""
+
+
+class Draws(Protocol):
+    """The random numbers of a run, or of several that are simulated together.
+
+    sensing, instants : increments and samples of sensors
+    states : the true states, a PathStates or the like
+    clocks : what the clocks of nodes show, by index; {} if all are right
+    """
+
+    sensing: Sensing
+    instants: Instants
+    states: Any
+    clocks: dict[int, NodeTime]
+
+    @property
+    def lives(self) -> LifeTable:
+        """When nodes are down."""
+
+    @property
+    def dither(self) -> np.ndarray | None:
+        """Streams of the dither of messages of few bits; None if messages are exact."""
+
+    def window(self) -> TickArrays:
+        """Return the next window of ticks."""
+
+    def path(self, together: int = 1) -> PathBlock:
+        """Return the next steps of the paths of so many runs."""
 
 
 class Source:
@@ -192,7 +221,7 @@ class Workspace:
         return xhat, root
 
     def begin(
-        self, draws: Any, traced: bool, buffer: SampleBuffer | None = None, together: int = 1
+        self, draws: Draws, traced: bool, buffer: SampleBuffer | None = None, together: int = 1
     ) -> Simulation:
         """Return the state at time 0 of ``together`` runs with the random numbers of ``draws``, a
         Source or ``batches.BatchDraws``, which write samples into ``buffer`` (None: the workspace's
@@ -250,7 +279,7 @@ class Workspace:
         )
         return state
 
-    def _begin_nodes(self, draws: Any) -> Any:
+    def _begin_nodes(self, draws: Draws) -> Any:
         """Return the records of nodes, with who is down and what clocks show in a run."""
         nodes = self.filters.nodes.copy()
         nodes["down"] = draws.lives.filters_down
