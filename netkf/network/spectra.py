@@ -23,10 +23,14 @@ def largest_laplacian_eigenvalue(degrees: FloatArray, ends: np.ndarray) -> float
     if not len(ends):
         return 0.0
     if len(degrees) > MAX_DENSE:
-        return _largest_sparse(degrees, ends)
-    L = np.diag(degrees)
-    L[ends[:, 0], ends[:, 1]] = L[ends[:, 1], ends[:, 0]] = -1.0
-    return float(np.linalg.eigvalsh(L)[-1])
+        largest = _largest_sparse(degrees, ends)
+    else:
+        L = np.diag(degrees)
+        L[ends[:, 0], ends[:, 1]] = L[ends[:, 1], ends[:, 0]] = -1.0
+        largest = float(np.linalg.eigvalsh(L)[-1])
+    # Rational eigenvalues of a matrix of integers are integers: rounding, which depends on the
+    # order of nodes, must not decide whether a gain equals one.
+    return float(round(largest)) if abs(largest - round(largest)) < 1e-9 * largest else largest
 
 
 def _largest_sparse(degrees: FloatArray, ends: np.ndarray) -> float:

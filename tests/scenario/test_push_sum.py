@@ -99,3 +99,11 @@ def test_rho_is_the_largest_eigenvalue_of_the_laplacian(size):
     L = networkx.laplacian_matrix(networkx.Graph(scenario.topology.links)).toarray()
     expected = np.linalg.eigvalsh(L.astype(float))[-1]
     assert scenario.topology.laplacian_radius == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_rho_that_is_an_integer_is_one_to_the_bit_in_any_order_of_nodes():
+    for graph in (netkf.parts.Complete(7), netkf.parts.Star(7), netkf.parts.Cycle(10)):
+        links, order = graph.build(0).links, np.random.default_rng(1).permutation(10).tolist()
+        for ids in (range(10), order):
+            edges = [(ids[i], ids[j]) for i, j in links]
+            assert netkf.parts.Edges(edges).build(0).laplacian_radius in (4.0, 7.0)
