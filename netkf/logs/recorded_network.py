@@ -262,19 +262,20 @@ def _round_number(value: float) -> float:
 
 def _fit_walk(readings: pd.DataFrame) -> dict[str, str]:
     """Return B and R of a random walk by moments of differences, and mean and cov of its start."""
+    # Terms are sorted, so that no digit depends on the names of nodes.
     near: list[tuple[float, float]] = []
     far: list[tuple[float, float]] = []
     for _, rows in readings.groupby("node"):
         t, y = rows["t"].to_numpy(), rows["y0"].to_numpy()
         for lag, found in ((1, near), (LAG, far)):
             found += list(zip(t[lag:] - t[:-lag], (y[lag:] - y[:-lag]) ** 2, strict=True))
-    moments = [np.array(found).mean(axis=0) if found else np.zeros(2) for found in (near, far)]
+    moments = [np.mean(sorted(found), axis=0) if found else np.zeros(2) for found in (near, far)]
     gap, change = moments[1] - moments[0]
     rate = max(change / gap, 0.0) if gap > 0.0 else 0.0
     noise = max(0.5 * (moments[0][1] - rate * moments[0][0]), 0.0)
-    means = readings.groupby("node")["y0"].mean()
+    means = readings.groupby("node")["y0"].mean().sort_values()
     between = float(means.var(ddof=0)) if len(means) > 1 else 0.0
-    first = readings.groupby("node")["y0"].first()
+    first = readings.groupby("node")["y0"].first().sort_values()
     R = max(noise + between, 1e-9)
     values = {"B": max(math.sqrt(rate), 1e-6), "R": R, "mean": first.mean()}
     values["cov"] = max(float(first.var(ddof=0)), R)

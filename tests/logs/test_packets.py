@@ -849,6 +849,17 @@ def test_places_and_readings_beside_a_log_are_taken_whole_or_counted(tmp_path):
         netkf.import_log(tmp_path, "csv", tmp_path / "two")
 
 
+@pytest.mark.parametrize("names", ["abcd", "abdc"])
+def test_the_model_of_readings_does_not_depend_on_names(names, tmp_path):
+    rows = ["t,sender,receiver,number", *(f"{k},a,{'bcd'[k % 3]},{k}" for k in range(9))]
+    (tmp_path / "packets.csv").write_text("\n".join(rows))
+    values = zip(names, (1.827, 0.322, -0.278, 1.858), strict=True)
+    rows = ["t,node,y0", *(f"1,{node},{y}" for node, y in values)]
+    (tmp_path / "readings.csv").write_text("\n".join(rows))
+    paths, _ = netkf.import_log(tmp_path, "csv", tmp_path / "out")
+    assert netkf.load(paths[0]).plant.mean.tolist() == [0.9323]
+
+
 def test_columns_of_decimal_commas_may_have_whole_numbers(tmp_path):
     write(tmp_path / "log.csv", ["t;src;dst;seq", "1;1;2;0", "2,5;1;2;1", "3;2;1;0"])
     write(tmp_path / "positions.csv", ["node;x;y", "1;0;3", "2;10,5;4"])
