@@ -18,6 +18,7 @@ import numpy as np
 from netkf.algorithms.registry import split_choice
 from netkf.core.contracts import is_netkf_class
 from netkf.core.fields import Component, SourceFile
+from netkf.core.printable import NamedNode
 from netkf.network.channels import Channel
 from netkf.network.clocks import LinkClock
 from netkf.network.graphs import RandomGraph
@@ -203,6 +204,6 @@ def toml_text(value: Any) -> str:
         return "[" + ", ".join(map(toml_text, value)) + "]"
     if isinstance(value, bool):
         return "true" if value else "false"
-    if isinstance(value, SourceFile):
+    if isinstance(value, (SourceFile, NamedNode)):
         return json.dumps(value.name, ensure_ascii=False)
     return json.dumps(value, ensure_ascii=False) if isinstance(value, str) else repr(value)

@@ -646,7 +646,7 @@ CAUSES = {
 
 
 def test_names_with_commas_and_quotes_stand_in_the_tables_of_a_twin(tmp_path):
-    names = ["a,b", 'c"d']
+    names = ["a,b", "c\"d'e\\f"]
     life = {"kind": "crashes", "nodes": names, "mean_up": 1.0, "mean_down": 0.5}
     network = {
         "graph": {"kind": "edges", "edges": [names]},
