@@ -49,8 +49,7 @@ class LossLaw(NamedTuple):
     opposite    : (D,) index of the opposite direction, -1 without one
     links       : the directions, (sender, receiver)
     steady      : all messages of a link are lost with one probability
-    symmetric   : both messages of an exchange may share one draw
-    shared      : some of them do, so that each draw is counted twice
+    shared      : both messages of an exchange share one draw, which is counted twice
     at_once     : both directions carry messages at once and draw their own losses
     share       : probability that all hearers of a broadcast have one fate
     hops        : (D, H) probability that message k is lost, on hop k mod H; None without hops
@@ -62,7 +61,6 @@ class LossLaw(NamedTuple):
     opposite: np.ndarray
     links: Sequence[tuple[int, int]]
     steady: bool = False
-    symmetric: bool = False
     shared: bool = False
     at_once: bool = False
     share: float = 0.0
@@ -182,7 +180,7 @@ def _loss_interval(
     if rare and law.independent:
         # The sum of independent losses of unequal probabilities has lighter tails than that of
         # equal ones (Hoeffding 1956). Both directions of a link may share one loss.
-        per_draw = 2 if law.symmetric else 1
+        per_draw = 2 if law.shared else 1
         limits = probability_interval(int(losses.sum()) // per_draw, int(total) // per_draw, level)
         return deviation_interval(expected, limits)
     if rare:
@@ -270,7 +268,7 @@ def compare_independence(law: LossLaw, counts: LossCounts, level: float) -> LawC
     q, sent = law.lost, counts.sent.sum(axis=1)
     distances = []
     # Where both directions of a link share one draw, each event is counted twice.
-    variance = neighbours_variance(q) * (2.0 if law.symmetric else 1.0)
+    variance = neighbours_variance(q) * (2.0 if law.shared else 1.0)
     pairs = np.maximum(sent - 1, 0)
     found = correlation_of_runs(
         counts.repeated - pairs * q**2, pairs, q * (1.0 - q), variance, level / 3.0
@@ -320,11 +318,11 @@ def correlation_of_runs(
 
 
 def _links_apart(law: LossLaw, counts: LossCounts, level: float) -> list[tuple[Interval, str]]:
-    # One direction of a link stands for both, which may share their draws.
-    direction_of_link: dict[tuple[int, int], int] = {}
-    for k, (i, j) in enumerate(law.links):
-        direction_of_link.setdefault((min(i, j), max(i, j)), k)
-    columns = np.array(list(direction_of_link.values()))
+    # Of directions that share their draws the one that has carried more messages stands for both.
+    total = counts.sent.sum(axis=(0, 1)).tolist()
+    ends = [(min(link), max(link)) if law.shared else link for link in law.links]
+    most = {ends[k]: k for k in sorted(range(len(ends)), key=total.__getitem__)}
+    columns = np.array(sorted(most.values()))
     sent, lost = (part.reshape(-1, part.shape[2])[:, columns] for part in counts[:2])
     q = law.lost[columns]
     excess, variances = lost - sent * q, sent * (q * (1.0 - q))

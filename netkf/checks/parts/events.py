@@ -184,7 +184,6 @@ def loss_law(scenario: Scenario) -> LossLaw:
         independent=stated.independent and share == 0.0 and _redraws_links(scenario),
         chain=stated_law(channel.loss, "loss") if one_step else None,
         steady=has_constant_losses(scenario),
-        symmetric=channel.symmetric,
         shared=bool(scenario.network.one_fate and (opposite >= 0).any()),
         opposite=opposite,
         at_once=at_once and not channel.symmetric,

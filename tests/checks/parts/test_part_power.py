@@ -16,7 +16,13 @@ from netkf.checks.parts.network_rows import (
     pair_probabilities,
 )
 from netkf.laws.intervals import correlation_interval, deviation_interval, probability_interval
-from netkf.laws.losses import PairCounts, count_outcomes, mean_correlation
+from netkf.laws.losses import (
+    LossLaw,
+    PairCounts,
+    compare_independence,
+    count_outcomes,
+    mean_correlation,
+)
 from netkf.laws.noise import _between, _in_size, _in_time
 from netkf.laws.ticks import CELLS, Ranks, correlate_neighbours, largest_correlation
 from netkf.scenario.reading import from_table
@@ -156,6 +162,21 @@ def test_parts_of_runs_with_few_messages_accuse_nobody(mean):
     assert accused < 18
     same = np.repeat(excess[:, :1], 2, axis=1)
     assert mean_correlation(same, sent * q * (1.0 - q), level).low > 0.0
+
+
+@pytest.mark.parametrize("hub", [0, 2])
+def test_links_that_lose_together_are_found_whichever_end_has_the_lower_id(hub):
+    """Two leaves send to a hub that sends nothing, and their messages share their fate."""
+    links = sorted({(a, b) for leaf in {0, 1, 2} - {hub} for a, b in ((leaf, hub), (hub, leaf))})
+    opposite = np.array([links.index(link[::-1]) for link in links])
+    speaks = np.array([link[1] == hub for link in links])
+    lost = (np.random.default_rng(5).random((100, 40, 1)) < 0.3) & speaks
+    counts = count_outcomes(lost, opposite)
+    counts = counts._replace(sent=counts.sent * speaks)
+    law = LossLaw(np.full(4, 0.3), True, None, opposite, links)
+    worst = compare_independence(law, counts, 0.01).worst
+    assert worst is not None
+    assert "correlation of losses" in worst[1]
 
 
 def test_correlations_of_noises_are_those_of_the_pairs_that_are_there():
