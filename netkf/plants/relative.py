@@ -184,7 +184,7 @@ class RelativePositionSensor(PositionedSensor):
         self, layout: Layout, pairs: Sequence[tuple[Place, Place]]
     ) -> list[RelativePositionSensor]:
         """Return the stacked state's sensors that stand for it, of ``pairs``, the reader first."""
-        self.check_block(pairs[0][0].n if pairs else 0)
+        self.check_block(pairs[0][0].n)
         places: dict[int | None, list[tuple[Place, Place]]] = {}
         for own, other in pairs:
             places.setdefault(own.node, []).append((own, other))

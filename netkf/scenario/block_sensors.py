@@ -133,7 +133,12 @@ def estimated_blocks(
 
 def _of_blocks(sensor: Any, layout: Layout, topology: Topology) -> Iterator[Any]:
     if isinstance(sensor, RELATIVE):
-        yield from sensor.lowered(layout, list(_pairs(sensor, layout, topology)))
+        pairs = list(_pairs(sensor, layout, topology))
+        if not pairs:
+            rule = "must be others to read: no reader has a link to another node with its block"
+            remedy = "add links, name another block in of, or write to = [[reader, other], ...]"
+            raise ScenarioError("to", rule, sensor.to, remedy)
+        yield from sensor.lowered(layout, pairs)
         return
     name = _name_of(sensor, layout)
     if name is None:

@@ -363,6 +363,7 @@ def test_readings_of_pairs_that_reach_nobody_are_noted(
         ('of = "pose"\nH', 'of = "prose"\nH', "sensors[0].of", "must be the name of one of"),
         ('of = "pose"\nH = [[1.0]]', 'of = "pose"\nH = [[1.0, 2.0]]', "sensors[0].H", "1 columns"),
         ("nodes = [1, 2, 3]", "nodes = [1, 2]", "sensors[1].to", None),
+        ("nodes = [1, 2, 3]", "nodes = [1, 3]", "sensors[1].to", "must be others to read"),
         ("nodes = [1, 2, 3]", "nodes = [1, 2, 4]", "plants[0].nodes[2]", "node of the graph"),
         ("nodes = [1, 2, 3]", "nodes = [1, 2, 2]", "plants[0].nodes", "two blocks"),
         (
