@@ -79,7 +79,11 @@ class VectorFunction:
         self._write(arrays[0].copy(), arrays[1].copy(), t, period, arrays[2])
 
     def _call_with_arrays(self, x: Any, u: Any, t: float, period: float, out: Any) -> None:
-        x, u, out = (a.reshape(shape) for a, shape in zip((x, u, out), self._shapes, strict=True))
+        # As at an address, what follows the numbers of an array is not looked at.
+        x, u, out = (
+            a.reshape(-1)[: math.prod(shape)].reshape(shape)
+            for a, shape in zip((x, u, out), self._shapes, strict=True)
+        )
         if self._is_kernel:
             self._function(x, u, t, *([period] if self._takes_period else []), out)
         else:

@@ -13,7 +13,9 @@ import pytest
 
 from netkf.linalg import structs
 from netkf.linalg.compiling import kernel
+from netkf.linalg.functions import plain_functions
 from netkf.linalg.plain import is_plain, plain_kernel
+from netkf.linalg.vector_functions import VectorFunction
 from netkf.linalg.words import high_word
 
 HERE = Path(__file__).parent
@@ -120,3 +122,12 @@ def test_lanes_structs_and_small_matrices_pass_their_tests_as_plain_python():
     done = subprocess.run(command, check=False, env=told, capture_output=True, cwd=HERE.parents[1])
     assert done.returncode == 0, done.stdout.decode()
     assert b" passed" in done.stdout
+
+
+def test_plain_functions_take_the_first_numbers_of_arrays(monkeypatch):
+    """As compiled ones do at an address: tables have room for the rows of all sensors."""
+    monkeypatch.setattr("netkf.linalg.vector_functions.is_plain", lambda: True)
+    double = VectorFunction(lambda x, u, t: 2.0 * x, ((2,), (0,), (2,)), is_kernel=False)
+    out = np.zeros(4)
+    plain_functions[double.address](np.arange(3.0), np.zeros(0), 0.0, 0.0, out)
+    assert out.tolist() == [0.0, 2.0, 0.0, 0.0]
