@@ -10,6 +10,7 @@ import numpy as np
 
 from netkf.algorithms.kernels.nonlinear_rows import NonlinearRows, add_values
 from netkf.algorithms.kernels.pairs import Pairs
+from netkf.core.places import Place
 from netkf.engines.compiled.life_tables import LifeTable
 from netkf.engines.compiled.nonlinear_rows import NonlinearSetup
 from netkf.engines.compiled.own_sensors import read_whitened
@@ -206,37 +207,51 @@ class SlotReadings:
         self, s: AssignedSensor, path: Any, times: SlotTimes, y: FloatArray, H: FloatArray
     ) -> None:
         """Write the recorded values of a sensor that reads pairs."""
-        setup, pairs, scenario, h = self._setup, self.pairs, self._scenario, s.estimator
+        columns, pairs, h, p = self._setup.columns, self.pairs, s.estimator, len(s.R)
         assert pairs is not None
-        assert setup.pairs is not None
-        sensor: Any = scenario.located_sensors[s.placed_sensor.entry]
-        p, believed = len(s.R), scenario.input_responses and scenario.input_responses.believed
-        rows = slice(s.row, s.row + s.rows)
-        y[:, times.sensed, h, rows] = 0.0 if sensor.linear else np.nan
+        sensor: Any = self._scenario.located_sensors[s.placed_sensor.entry]
+        responses = self._scenario.input_responses
+        believed = None if responses is None else responses.believed
+        y[:, times.sensed, h, s.row : s.row + s.rows] = 0.0 if sensor.linear else np.nan
         for k in np.flatnonzero(times.sensed).tolist():
             for m, (values, anchor, R) in enumerate(path.readings_at(times.first + k, s.R)):
-                place = setup.columns.of_reading(h, sensor, anchor)
+                place = columns.of_reading(h, sensor, anchor)
                 pair, first = s.pair + m, s.row + m * p
                 if place is not None:
                     first = int(pairs.row[pair])
-                    pairs.block[k, pair] = setup.columns.number(place)
+                    pairs.block[k, pair] = columns.number(place)
                 if sensor.linear:
-                    there = np.isfinite(values)
-                    matrix = matrix_of(sensor, anchor, setup.n)
-                    z = values
+                    matrix, z = matrix_of(sensor, anchor, self._setup.n), values
                     if believed is not None:
                         z = values - matrix @ believed.states(np.array([times.first + k]))[0]
-                    both = np.column_stack([z, matrix])[there]
-                    white = solve_lower(cholesky(R[there][:, there]), both)
-                    y[:, k, h, first : first + p], H[:, k, h, first : first + p] = 0.0, 0.0
-                    rows = slice(first, first + len(white))
-                    y[:, k, h, rows] = white[:, :1]
-                    H[:, k, h, rows] = setup.columns.of(h, white[:, 1:], place)[..., None]
+                    self._write_linear(s, k, first, (z, matrix, R), place, y, H)
                 elif place is None:
                     self._write_nonlinear(s, k, first, (values, anchor, R), y, H)
                 else:
                     y[:, k, h, first : first + p] = values[:, None]
                     pairs.rows.R[k, pair, :p, :p] = R
+
+    def _write_linear(
+        self,
+        s: AssignedSensor,
+        k: int,
+        first: int,
+        reading: tuple[FloatArray, FloatArray, FloatArray],
+        place: Place | None,
+        y: FloatArray,
+        H: FloatArray,
+    ) -> None:
+        """Write a ``reading`` of slot k, values, H and R, whitened into the rows from ``first`` on,
+        which is also about the block ``place``; values that are nan are missing.
+        """
+        (values, matrix, R), h, p = reading, s.estimator, len(s.R)
+        there = np.isfinite(values)
+        both = np.column_stack([values, matrix])[there]
+        white = solve_lower(cholesky(R[there][:, there]), both)
+        y[:, k, h, first : first + p], H[:, k, h, first : first + p] = 0.0, 0.0
+        rows = slice(first, first + len(white))
+        y[:, k, h, rows] = white[:, :1]
+        H[:, k, h, rows] = self._setup.columns.of(h, white[:, 1:], place)[..., None]
 
     def _read_nonlinear(
         self, s: AssignedSensor, path: Any, times: SlotTimes, y: FloatArray, H: FloatArray
