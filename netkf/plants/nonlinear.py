@@ -362,6 +362,9 @@ class PositionedSensor(NonlinearSensor):
         if self.heading is not None and (self.heading >= n or not self.turns):
             rule = f"must be a component of a state of {n}, and means nothing without directions"
             raise ScenarioError("heading", rule, self.heading, "correct it, or leave it out")
+        if self.heading in self.states:
+            rule = "must be another component of the state than those of the position"
+            raise ScenarioError("heading", rule, self.heading, "correct it, or leave it out")
         dimensions = (2, 3) if self.rows == 1 and not self.turns else (2,)
         if len(self.states) not in dimensions:
             rule = f"must be {' or '.join(map(str, dimensions))} for this sensor"

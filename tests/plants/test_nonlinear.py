@@ -170,6 +170,7 @@ def test_what_linear_theory_cannot_promise_is_said(tracking):
         ({"positions": [[0.0, 0.0]]}, "sensors[0].positions: must be 3 rows of 2"),
         ({"R": [[1.0, 0.0], [0.0, 1.0]]}, "sensors[0].R: must be 1 x 1"),
         ({"kind": "bearing", "states": [0, 1, 2]}, "sensors[0].states: must be 2"),
+        ({"kind": "bearing", "heading": 2}, "sensors[0].heading: must be another component of"),
         ({"nodes": [0, 99]}, "sensors[0].nodes[1]: must be a node of the graph; got 99"),
     ],
 )
