@@ -59,6 +59,7 @@ from netkf.engines.compiled.visits import (
     queue_sample,
     queue_visit,
 )
+from netkf.linalg.addresses import address_of, call_at
 from netkf.linalg.arrays import IntArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.structs import struct_at
@@ -149,14 +150,17 @@ def simulate_together(state: Simulation, visits: Visits, batch: BatchArrays, gro
     """
     ticks = int(batch.first[-1]) // len(batch.lengths)
     pause, progress = pause_of(state, ticks, group), np.zeros(group, dtype=PROGRESS)
-    simulate_agenda(state, visits.memory, batch.memory, progress, pause)
+    visits.process = address_of(process_visits, state, visits)
+    simulate_agenda(state.general, visits.memory, batch.memory, progress, pause)
 
 
 def simulate_single_run(state: Simulation, visits: Visits) -> int:
     """Simulate one run until it needs something from Python; return the request (WANT_... or DONE).
     Changes ``state``, the run; ``visits`` is an empty queue, and empty again after the call.
     """
-    return int(simulate_agenda(state, visits.memory, no_batch().memory, NO_PROGRESS, math.inf))
+    visits.process = address_of(process_visits, state, visits)
+    none = no_batch().memory
+    return int(simulate_agenda(state.general, visits.memory, none, NO_PROGRESS, math.inf))
 
 
 @kernel
@@ -170,7 +174,7 @@ def simulate_agenda(
     """Simulate the R runs of a batch, G = ``len(progress)`` of them together, which process their
     visits (predictions of one node, or of two that then combine) every ``pause`` seconds of
     simulated time. If ``progress`` is empty simulate one run until it needs something from Python.
-    Return the request, DONE for a batch.
+    Return the request, DONE for a batch. Compiled once for all n, ``process_visits`` for each.
 
     ``visits_memory`` and ``batch_memory`` are the blocks of memory (int64 words) of a Visits and a
     BatchArrays, since numba dispatches on arrays faster than on structs; ``progress`` (G,) are
@@ -182,7 +186,7 @@ def simulate_agenda(
         if state.tick_at == 0:
             fill_arrival_bits(state, 0, state.ticks_stop, 0)
         request = run_agenda(state, visits, NEVER)
-        process_visits(state, visits)
+        call_at(visits.process, state, 0, visits)
         return request
     batch = struct_at(batch_memory, BatchArrays)
     runs = len(batch.lengths)
@@ -224,7 +228,7 @@ def simulate_group(
             running = run_agenda(state, visits, until) != DONE or running
             suspend(state, batch, progress, k)
         # Together, so that more visits are in one level and fill the lanes.
-        process_visits(state, visits)
+        call_at(visits.process, state, 0, visits)
         if until < frame:
             pauses += 1
         elif frame < NEVER:
@@ -247,9 +251,9 @@ def move_origin_of_run(state: Simulation, visits: Visits, first: int, now: float
     seek_piece(state, now)
     for h in range(len(state.nodes)):
         if visits.count == len(visits.records):
-            process_visits(state, visits)
+            call_at(visits.process, state, 0, visits)
         queue_visit(state, visits, now, first + h)
-    process_visits(state, visits)
+    call_at(visits.process, state, 0, visits)
     x = state.path.x_stop[state.run, state.piece]
     for h in range(len(state.nodes)):
         for i in range(len(x)):
@@ -299,7 +303,7 @@ def run_agenda(state: Simulation, visits: Visits, until: float) -> int:
     while request == FULL or (request == WANT_SAMPLES and until < NEVER):
         request = queue_events(state, visits, until)
         if request == FULL:
-            process_visits(state, visits)
+            call_at(visits.process, state, 0, visits)
     return request
 
 

@@ -43,6 +43,7 @@ from netkf.engines.compiled.lane_readings import (
 from netkf.engines.compiled.lane_series import NEAR, LaneSeries, max_moments
 from netkf.engines.compiled.pair_exchange import PairExchange, receive, send_both
 from netkf.engines.compiled.state import Filters, Simulation
+from netkf.linalg.addresses import NOTHING
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES, MANY, gather, load, prefetch, scatter, store, turn, with_spare
@@ -116,6 +117,7 @@ class Visits(Struct):
     x, moved : (n, L), means
     S, old_S, V, T : (n, n, L), roots and scratch
     exchange : what the nodes of a pair do with each other's messages
+    process : the address of ``process_visits``
     """
 
     records: np.ndarray
@@ -144,6 +146,7 @@ class Visits(Struct):
     T: FloatArray
     moved: FloatArray
     exchange: PairExchange
+    process: int
     waiting: int
     count: int
     top: int
@@ -196,6 +199,7 @@ def empty_visits(
         sensing=sensing,
         **{name: with_spare(shape) for name, shape in shapes.items()},
         intervals=np.zeros(1 << (places - 1).bit_length(), dtype=INTERVAL),
+        process=NOTHING,
         waiting=0,
         count=0,
         top=0,
@@ -263,7 +267,7 @@ def queue_sample(state: Simulation, visits: Visits, first: int) -> None:
 
 
 @kernel
-def process_visits(state: Simulation, visits: Visits) -> None:
+def process_visits(state: Simulation, _: int, visits: Visits) -> None:
     """Process all queued visits and empty the queue: a visit predicts one node to a time, or two
     nodes that then combine their estimates, or stores a sample. Visits of one level have no node in
     common and are computed side by side, level after level. Changes ``state.xhat``, ``root`` and
