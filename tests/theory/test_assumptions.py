@@ -8,6 +8,7 @@ import pytest
 import netkf
 from netkf import parts, theory
 from netkf.network import channels
+from netkf.scenario.reading import from_table
 from tests.conftest import SCENARIOS
 
 PATH = {"kind": "path", "nodes": 2}
@@ -94,6 +95,40 @@ def test_only_the_channel_without_losses_makes_every_exchange_a_swap():
     channel = channels.Channel(loss=NoLoss(), symmetric=False)
     network = dataclasses.replace(scenario.network, channel=channel)
     assert not holds(dataclasses.replace(scenario, network=network))["every exchange is a swap"]
+
+
+LATE = {"kind": "uniform", "low": 0.0, "high": 0.9}
+PAIRS = {
+    "nothing is lost": ({"loss": {"kind": "bernoulli", "delivery": 1.0}, "symmetric": False}, True),
+    "all are late": ({"delay": {"kind": "constant", "seconds": 0.9}, "symmetric": False}, True),
+    "one is late": ({"delay": LATE, "symmetric": False}, False),
+    "both are late": ({"delay": LATE}, True),
+    "one is lost": ({"loss": {"kind": "per-link"}}, False),
+    "one is lost at times": ({"loss": {"kind": "scheduled", "path": "times.csv"}}, None),
+    "both are lost": ({"loss": {"kind": "gilbert-elliott", "to_bad": 0.2, "to_good": 0.4}}, True),
+}
+
+
+@pytest.mark.parametrize("kind", ["gossip", "push-sum"])
+@pytest.mark.parametrize("case", PAIRS)
+def test_both_messages_of_an_exchange_arrive_or_none(case, kind, tmp_path):
+    rows = ["sender,receiver,delivery_probability", "0,1,0.3", "1,0,0.9", "1,2,0.5", "2,1,0.5"]
+    (tmp_path / "links.csv").write_text("\n".join(rows))
+    (tmp_path / "times.csv").write_text("from,until,sender,receiver,delivery\n0,5,0,1,0.5")
+    channel, expected = PAIRS[case]
+    pairwise, sizes = kind == "gossip", {} if kind == "gossip" else {"gamma": 1, "delta": 4.0}
+    slots = {"kind": "matching", "protocol": "one-edge"} if pairwise else {"kind": "broadcast"}
+    graph = {"kind": "csv", "path": "links.csv"}
+    table = {
+        **{"format": 1, "name": "pairs", "horizon": 9.0, "probe": 1.0},
+        "plant": {"kind": "linear", "F": [[0.9]], "Q": [[1.0]], "period": 1.0},
+        "sensors": [{"nodes": [0], "H": [[1.0]], "R": [[1.0]]}],
+        "network": {"graph": graph, "activation": slots, "channel": channel},
+        "filter": {"kind": kind, **sizes},
+    }
+    found = holds(from_table(table, tmp_path))
+    name = "every exchange is a swap" if pairwise else "both directions of a link fail together"
+    assert found[name] is expected
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -16,6 +16,7 @@ import numpy as np
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.network.clocks import LinkClock
+from netkf.network.delays import delay_depends_on_message
 from netkf.network.losses import (
     GilbertElliott,
     has_conditions,
@@ -216,6 +217,29 @@ def all_messages_arrive(scenario: Scenario) -> bool:
     """Return True if every message of a scenario in slots arrives in its exchange."""
     delay = scenario.network.channel.delay.fixed
     return delay is not None and delay <= scenario.phase_length and nothing_is_lost(scenario)
+
+
+def both_or_none(scenario: Scenario) -> bool | None:
+    """Return True if both messages of an exchange in a slot arrive or neither; None if unknown."""
+    channel, horizon = scenario.network.channel, scenario.horizon
+    directions = {link: scenario.transmission(link) for link in scenario.topology.directions}
+    if scenario.messages_queue:
+        return None
+    are_sure = all(channel.mean_delivery(sent, horizon) == 1.0 for sent in directions.values())
+    if are_sure and channel.delay.fixed is not None:
+        return True
+    of_senders = channel.draws_for_senders and scenario.has_broadcasts and not are_sure
+    if of_senders or not channel.symmetric:
+        return False
+    if delay_depends_on_message(channel.delay) or not has_constant_losses(scenario):
+        return None
+    # They share their draws, but the probabilities of the two directions may differ.
+    none, bad = np.zeros(2), np.array([False, True])
+    laws = {
+        link: channel.deliveries(sent._replace(number=none.astype(int), time=none, bad=bad))
+        for link, sent in directions.items()
+    }
+    return all(np.array_equal(law, laws.get(link[::-1], law)) for link, law in laws.items())
 
 
 def delivery_of(scenario: Scenario, direction: tuple[int, int]) -> float:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from netkf.core.errors import TheoryError
 from netkf.core.printable import list_some
-from netkf.network.losses import NoLoss
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import AssumptionRow
 from netkf.theory.common.plant_assumptions import slot_plant_rows, start_rows
+from netkf.theory.common.random_links import all_messages_arrive, both_or_none
 from netkf.theory.gossip.matchings import detecting_walk, mean_swaps, period_of
 
 MAX_LISTED = 12  # matchings that a row names
@@ -60,17 +60,16 @@ def _walk_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _swap_rows(scenario: Scenario) -> list[AssumptionRow]:
-    channel = scenario.network.channel
     # A swap needs both messages: if one is lost, its pair exists twice and the other is gone.
-    # The exact class: one that derives from it may lose messages.
-    lossless = type(channel.loss) is NoLoss
-    holds = lossless or channel.symmetric
+    holds = both_or_none(scenario)
     evidence = (
-        "nothing is lost"
-        if lossless
-        else "both messages of a pair are lost together: a swap or none"
-        if holds
+        "not known: outcomes of the two messages of a pair may differ"
+        if holds is None
         else "one of two messages may be lost: a pair is then copied and the other one is gone, so "
         "tokens are no permutation any more"
+        if not holds
+        else "nothing is lost"
+        if all_messages_arrive(scenario)
+        else "both messages of a pair are lost together: a swap or none"
     )
     return [("every exchange is a swap", "G (10)", holds, evidence)]

@@ -13,6 +13,7 @@ from netkf.network.matchings import Broadcast
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import AssumptionRow, true_model_row
 from netkf.theory.common.plant_assumptions import connected_row, judge_driven, judge_observed
+from netkf.theory.common.random_links import both_or_none
 from netkf.theory.push_sum.averaging import Averaging
 from netkf.theory.push_sum.certified_gamma import Moment, minimum_gamma
 from netkf.theory.push_sum.disconnection import disconnection_probability
@@ -71,7 +72,7 @@ def _fresh_links_row(scenario: Scenario, law: Averaging | None, reason: str) -> 
 
 
 def _joint_failure_row(scenario: Scenario, law: Averaging | None) -> AssumptionRow:
-    joint = scenario.network.channel.symmetric
+    joint = both_or_none(scenario) if law is None else None
     if law is not None:
         # Both directions have one probability, and each is up exactly if both are.
         joint = bool(np.array_equal(law.hears[:, 0], law.hears[:, 1])) and bool(
@@ -80,7 +81,9 @@ def _joint_failure_row(scenario: Scenario, law: Averaging | None) -> AssumptionR
     evidence = (
         "one fate for both"
         if joint
-        else ("mass is lost or copied, so that the numbers N^(i) are random in the limit")
+        else "not known: outcomes of the two directions may differ"
+        if joint is None
+        else "mass is lost or copied, so that the numbers N^(i) are random in the limit"
     )
     return "both directions of a link fail together", "P Assumption 3", joint, evidence
 
