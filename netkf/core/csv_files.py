@@ -117,10 +117,12 @@ def read_columns(
     gaps: Collection[str] = (),
     nodes: Collection[str] = NODES,
     words: Mapping[str, tuple[str, ...]] = MappingProxyType({}),
+    new_nodes: bool = False,
 ) -> Columns:
     """Return the named columns, optional ones only if they are there. Entries of columns in
     ``gaps`` may be empty or nan, and are nan then; those of columns in ``nodes`` may be names, and
-    are ids then; those of a column in ``words`` are one of these, and its index then.
+    are ids then; those of a column in ``words`` are one of these, and its index then. Of a table of
+    ``new_nodes`` names must not look like numbers, such as -1.
 
     Raises ScenarioError, with the file and the line, for a missing column, a row of another length
     than the header, or an entry that is not a finite number, or no stamp in a column of STAMPS.
@@ -133,7 +135,7 @@ def read_columns(
             if sheet.header.count(name) > 1:
                 rule = f"{source.name} must have one column {name}"
                 raise ScenarioError("path", rule, sheet.header, "rename the others")
-        entries = _Entries(source, sheet)
+        entries = _Entries(source, sheet, new_nodes)
         places = [(sheet.header.index(n), n in nodes, n in STAMPS, n in gaps) for n in names]
         named = {sheet.header.index(name): words[name] for name in names if name in words}
         for line, row in sheet.rows:
@@ -176,8 +178,9 @@ class _Sheet(NamedTuple):
 class _Entries:
     """The entries of one row after the other, as numbers."""
 
-    def __init__(self, source: SourceFile, sheet: _Sheet) -> None:
+    def __init__(self, source: SourceFile, sheet: _Sheet, new_nodes: bool) -> None:
         self._source, self._header, self._separator = source, sheet.header, sheet.separator
+        self._new_nodes = new_nodes
         self._line, self._row = 0, [""]
         # The first lines with a decimal comma and a decimal point: a table must not mix them.
         self._commas: dict[str, int] = {}
@@ -227,7 +230,11 @@ class _Entries:
             return source.node_ids[name]
         if not name and not may_miss:
             raise self._refusal(column, "must be the id or the name of a node", "correct the entry")
-        if not name or (is_number_text(name) and not _ADDRESS.fullmatch(name)):
+        is_number = is_number_text(name) and not _ADDRESS.fullmatch(name)
+        if is_number and source.node_ids is None and not self._new_nodes:
+            # A node of a graph of networkx may be -1, or nan: then that is its name.
+            is_number = 0.0 <= float(name.replace(",", ".")) < math.inf
+        if not name or is_number:
             number = self.number(column, may_miss)
             if number < 0.0:
                 raise self._refusal(column, "must be an integer from 0 to 2^53", "correct it")

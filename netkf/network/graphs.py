@@ -672,7 +672,9 @@ class CsvGraph(Graph):
         return self._read().topology(self.minimum, self.positions)
 
     def _read(self) -> LinkTable:
-        columns = read_columns(self.path, ("sender", "receiver"), ("delivery_probability",))
+        columns = read_columns(
+            self.path, ("sender", "receiver"), ("delivery_probability",), new_nodes=True
+        )
         listed = list(zip(columns.integers("sender"), columns.integers("receiver"), strict=True))
         # Numbers below 0 stand for names.
         names = {code: name for name, code in self.path.unknown.items()}
@@ -726,7 +728,7 @@ def _read_positions(source: SourceFile) -> tuple[dict[int, tuple[float, float]],
     if len(names) < 3:
         rule = f"{source.name} must have the columns node, x, y"
         raise ScenarioError("path", rule, list(names), "add what is missing")
-    columns = read_columns(source, names, nodes=names[:1])
+    columns = read_columns(source, names, nodes=names[:1], new_nodes=True)
     points = list(zip(columns[names[1]].tolist(), columns[names[2]].tolist(), strict=True))
     ids = columns.integers(names[0])
     first = first_rows(columns, ids, points, "a node must have one position")

@@ -30,7 +30,7 @@ def placed_nodes(scenario: Any) -> list[int | str]:
     source = scenario.network.positions
     if source is not None:
         with errors_under("network.positions"):
-            ids = read_columns(source, ("node",)).integers("node")
+            ids = read_columns(source, ("node",), new_nodes=True).integers("node")
         # Numbers below 0 stand for names.
         names = {code: name for name, code in source.unknown.items()}
         listed += [names.get(node, node) for node in ids]

@@ -191,6 +191,23 @@ def test_ids_with_zeros_before_them_are_those_of_tables(folder):
     assert tuple(scenario.sensors[0].nodes) == (2,)
 
 
+def test_numbers_that_are_no_ids_are_names_where_the_graph_has_them(folder):
+    """Nodes of networkx may be -1 or nan; elsewhere such a number is a mistake."""
+    graph = networkx.Graph([(-1, 7), (7, "nan")])
+    (folder / "ticks.csv").write_text("t,node,peer\n0.5,-1,7\n1.5,nan,7\n")
+    (folder / "readings.csv").write_text("t,node,y0\n0.2,-1,1\n1.2,nan,0.5\n")
+    sensors = [{"kind": "recorded", "path": "readings.csv", **SENSOR}]
+    network = SCENARIO["network"] | {"graph": graph, "channel": {}}
+    scenario = from_table(SCENARIO | {"sensors": sensors, "network": network}, folder)
+    run = netkf.simulate(scenario, engine="simpy")
+    for kind in ("sense", "tick"):
+        nodes = run.events[run.events.kind == kind].node
+        assert [str(scenario.topology.named(node)) for node in nodes] == ["-1", "nan"]
+    network["graph"] = {"kind": "path", "nodes": 3}
+    with pytest.raises(netkf.ScenarioError, match=r"line 2: node must .* got '-1'"):
+        from_table(SCENARIO | {"sensors": sensors, "network": network}, folder)
+
+
 def test_a_scenario_of_parts_takes_a_graph_and_names(folder):
     graph = network()
     graph.add_node("shed")
