@@ -159,11 +159,14 @@ def rounded_terms(scenario: Scenario, P: FloatArray, units: CovarianceUnits) -> 
     """Return the sizes (R, K, N), in ``units``, of terms whose roundings remain in ``P``, which is
     in ``units`` too.
     """
-    views = scenario.model_views
-    of_model = units.of_states if views is None else units.of_states[views[0]]
-    G = in_units(scenario.node_infos[0].information, 1.0 / of_model)
+    # Without blocks all nodes estimate the same states, with the information of all sensors.
+    infos = scenario.node_infos[: 1 if scenario.views is None else None]
+    informations = [
+        in_units(info.information, 1.0 / units.of_states[scenario.view(k)])
+        for k, info in enumerate(infos)
+    ]
     first = in_units(first_covariances(scenario), units.of_nodes)
-    return largest_terms(P, first, float(np.linalg.norm(G, 2)))
+    return largest_terms(P, first, max(float(np.linalg.norm(G, 2)) for G in informations))
 
 
 REPLAY_TOLERANCE = 1e-7  # of P, relative: two ways to compute it differ by roundings only

@@ -22,8 +22,9 @@ BOUND = "P is at least the covariance of the error, given the events"
         (ROBOTS, "block-intersection", {"filter__rule": "naive"}),
         (ROBOTS, "central", {"filter__estimates": "own+neighbours"}),
         (CLOCKED, "block-belief-propagation", {"network__lives": CRASHES}),
+        (ROBOTS, "partition", {"filter__estimates": "own+neighbours"}),
     ],
-    ids=["split", "naive", "central", "lives"],
+    ids=["split", "naive", "central", "lives", "partition"],
 )
 def test_overconfident_filters_of_blocks_are_found_and_no_others(
     tmp_path: Path, text: str, kind: str, changes: dict[str, object]
