@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,7 +30,22 @@ from netkf.theory.common.forms import MEAN, Forms
 
 PAYLOAD = "payload "
 """Prefix of names of arrays of messages."""
-NO_PLACES, NO_FORMS = np.zeros((0, 2), dtype=np.int64), np.zeros((0, 0))
+
+
+class Given(NamedTuple):
+    """Numbers beside the words of a node that a verb depends on.
+
+    places : (k, 2), for each of them (r, i): entry i of reading r, or of the offset for r = -1
+    forms : (k, C), their forms
+    readings : H (p, n) of each reading
+    """
+
+    places: IntArray = np.zeros((0, 2), dtype=np.int64)
+    forms: FloatArray = np.zeros((0, 0))
+    readings: Sequence[FloatArray] = ()
+
+
+NOTHING_GIVEN = Given()
 
 
 @kernel
@@ -246,8 +261,8 @@ class LinearVerbs:
     def update(self, h: int, gap: float, H: FloatArray, y: FloatArray) -> None:
         """Predict node ``h`` and update it with a reading ``y`` (p, C), whitened with ``H``."""
         self.run.reading = 0
-        words, places = self.node_words(h, 1), self._own_places[: len(H)]
-        self._apply(self.kernels.update, words, h, gap, places=places, others=y, readings=[H])
+        given = Given(self._own_places[: len(H)], y, [H])
+        self._apply(self.kernels.update, self.node_words(h, 1), h, gap, given)
 
     def emit(self, h: int, gap: float, m: int) -> None:
         """Predict node ``h`` and write its payload into message ``m``."""
@@ -262,22 +277,19 @@ class LinearVerbs:
         """
         words, heard = self.node_words(h, len(readings)), map(self.message_words, set(messages))
         # Reading 0 is the own one.
-        matrices = [np.zeros((0, self.n)), *(H for H, _ in readings)]
-        places, others = NO_PLACES, NO_FORMS
+        given = Given(readings=[np.zeros((0, self.n)), *(H for H, _ in readings)])
         if readings:
-            pairs = [(r, i) for r, H in enumerate(matrices) for i in range(len(H))]
+            pairs = [(r, i) for r, H in enumerate(given.readings) for i in range(len(H))]
             places = np.array(pairs, dtype=np.int64).reshape(-1, 2)
-            others = self.forms.table[np.concatenate([rows for _, rows in readings])]
+            rows = np.concatenate([rows for _, rows in readings])
+            given = given._replace(places=places, forms=self.forms.table[rows])
         keep, words = len(words), np.concatenate([words, *heard])
-        self._apply(
-            self.kernels.absorb, words, h, gap, keep=keep, places=places, others=others,
-            readings=matrices,
-        )  # fmt: skip
+        self._apply(self.kernels.absorb, words, h, gap, given, keep=keep)
 
     def shift(self, h: int, gap: float, offset: FloatArray) -> None:
         """Predict node ``h`` and move it with the origin, by ``offset`` (n, C)."""
-        words, places = self.node_words(h, 1), self._offset_places
-        self._apply(self.kernels.shift, words, h, gap, places=places, others=offset)
+        given = Given(self._offset_places, offset)
+        self._apply(self.kernels.shift, self.node_words(h, 1), h, gap, given)
 
     def restart(self, h: int, moved: FloatArray) -> None:
         """Let node ``h`` begin again, in coordinates that have ``moved`` (n,) since time 0."""
@@ -305,8 +317,8 @@ class LinearVerbs:
 
     def shift_message(self, m: int, offset: FloatArray) -> None:
         """Move message ``m`` with the origin, by ``offset`` (n, C) at the time of sending."""
-        words, places = self.message_words(m), self._offset_places
-        self._apply(self.kernels.shift_payload, words, m, 0.0, places=places, others=offset)
+        given = Given(self._offset_places, offset)
+        self._apply(self.kernels.shift_payload, self.message_words(m), m, 0.0, given)
 
     def _address(self, verb: Any, integers: int = 1) -> int:
         if verb not in self._addresses:
@@ -319,17 +331,15 @@ class LinearVerbs:
         words: IntArray,
         h: int,
         gap: float,
+        given: Given = NOTHING_GIVEN,
         m: int = -1,
         keep: int | None = None,
         written: int = 0,
-        places: IntArray = NO_PLACES,
-        others: FloatArray = NO_FORMS,
-        readings: Sequence[FloatArray] = (),
     ) -> None:
         """Predict, run a ``verb``, if any, on ``words`` (w,), and apply its map to the forms."""
-        # The first ``keep`` words may change, or all; the last ``written`` are only written.
-        # The verb depends on further numbers, whose forms are ``others`` (k, C): ``places`` (k, 2)
-        # say row i of reading r, or entry i of the offset for r = -1. With ``m`` it is ``emit``.
+        # The first ``keep`` words may change, or all; the last ``written`` are only written. With
+        # ``m`` the verb is ``emit``.
+        places, others, readings = given
         predict = self._address(self.kernels.predict)
         act = NOTHING if verb is None else self._address(verb, 1 if m < 0 else 2)
         kept, forms, rows = words[:keep], self.forms, self._row[words]
@@ -360,15 +370,15 @@ class LinearVerbs:
         floats = np.flatnonzero(self._is_float[kept])
         values, own = blocks[:, kept[floats]], rows[floats]
         linear = (values[1:] - values[0]).T
-        given = forms.table[rows[inputs], : forms.used]
+        sources = forms.table[rows[inputs], : forms.used]
         if len(others):
-            given = np.concatenate([given, others[:, : forms.used]])
+            sources = np.concatenate([sources, others[:, : forms.used]])
         # Some words depend on noise now that did not before.
         new = np.flatnonzero((own < 0) & linear.any(axis=1))
         if len(new):
             own[new] = self._row[kept[floats[new]]] = forms.take(len(new))
         targets = own >= 0
-        forms.table[own[targets], : forms.used] = linear[targets] @ given
+        forms.table[own[targets], : forms.used] = linear[targets] @ sources
 
 
 def _memories(struct: Any, arrays: dict[str, np.ndarray], steps: IntArray) -> np.ndarray:
