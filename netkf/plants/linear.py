@@ -19,7 +19,7 @@ from typing import Protocol
 import numpy as np
 
 from netkf.core.fields import covariance, field, seconds, square
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.portable import apply, cholesky, noise_root
 from netkf.plants.changes import LinearChange, matrices_of_pieces, schedule_of
 from netkf.plants.plant import Plant
@@ -44,6 +44,10 @@ class SlotPlant(Plant):
     def slot_time(self, k: int) -> float:
         """Return the start of slot k in seconds, on the grid of the scenario."""
         return self.time_grid.instant(k * self.period)
+
+    def slot_times(self, slots: IntArray) -> FloatArray:
+        """Return the starts (K,) of ``slots`` (K,) in seconds, each as :meth:`slot_time` does."""
+        return self.time_grid.snap(slots * self.period)
 
     def slots_of(self, times: FloatArray) -> np.ndarray:
         """Return the slots (K,) that contain each of K ``times`` (K,), in seconds."""

@@ -187,10 +187,9 @@ def _read_at(scenario: Scenario, nodes: np.ndarray, times: FloatArray) -> FloatA
     """Return when readings used at ``times`` (K,) were taken, nan where tables have none."""
     if not scenario.slotted:
         return times
-    plant, found = scenario.slot_plant, np.array(times)
+    plant = scenario.slot_plant
     slots = plant.slots_of(times)
-    numbers, place = np.unique(slots, return_inverse=True)
-    found = np.array([plant.slot_time(slot) for slot in numbers.tolist()])[place]
+    found = plant.slot_times(slots)
     for node in set(nodes.tolist()):
         records = [scenario.sensors[p.entry].record for p in scenario.placed_sensors[node]]
         if None not in records:

@@ -75,7 +75,7 @@ def collect_readings(
     }
     plant: Any = scenario.plant
     times_of = {
-        key: np.array([plant.slot_time(k) for k in ks]) if scenario.slotted else ks
+        key: plant.slot_times(np.array(ks, dtype=np.int64)) if scenario.slotted else ks
         for key, ks in numbers.items()
     }
     times = np.unique(np.concatenate([np.empty(0), *times_of.values()]))

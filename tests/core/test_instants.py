@@ -33,6 +33,7 @@ def test_periods_and_delays_of_whole_ticks_meet(numerator, number, delay, denomi
     sent = grid.instant(number * float(period))
     arrival = grid.instant(sent + float(late))
     assert sent == float(number * period)
+    assert grid.snap(np.array([number]) * float(period)).tolist() == [sent]
     assert arrival == float(number * period + late)
     assert grid.instant(arrival - sent) == float(late)
 

@@ -95,13 +95,12 @@ class SlotRuns:
         """Return True if all slots have been simulated."""
         return self._slot >= self.setup.slots
 
-    def following(self, max_events: int, timed: bool = True) -> tuple[SlotBlock, SampledStates]:
+    def following(self, max_events: int) -> tuple[SlotBlock, SampledStates]:
         """Simulate the next slots in all R runs, with about ``max_events`` events at most (0: no
-        limit); return the samples of these slots, or of all slots so far. ``timed``: compute the
-        times of slots, which event rows need.
+        limit); return the samples of these slots, or of all slots so far.
         """
         count = self._transmissions.count_slots(self._slot, max_events)
-        times = self._next_times(count, timed or bool(self._transmissions.tables))
+        times = self._next_times(count)
         messages = self._transmissions.messages(times)
         local, absolute, rebased = self._truth.states(self._slot, count)
         drawn, responses = self._truth.is_drawn, self._scenario.input_responses
@@ -191,9 +190,9 @@ class SlotRuns:
         """(R,) bool: runs with an estimate or covariance that is not finite."""
         return np.asarray(~np.isfinite(by_run(self._total, self.runs)))
 
-    def _next_times(self, count: int, timed: bool) -> SlotTimes:
-        """Return what happens in the next ``count`` slots, and, if ``timed``, when they begin."""
-        setup, algorithm, plant = self.setup, self.setup.algorithm, self._scenario.slot_plant
+    def _next_times(self, count: int) -> SlotTimes:
+        """Return what happens in the next ``count`` slots, and when they begin."""
+        setup, algorithm = self.setup, self.setup.algorithm
         slots = np.arange(self._slot, self._slot + count)
         recorded, active, exchanged = setup.activity(slots)
         # Filters that do not predict use no reading in slot 0: its sample is their initial state.
@@ -203,10 +202,7 @@ class SlotRuns:
         # Indices count from the first sample of the run, or of these slots.
         indices = np.arange(first, last) - (first if self.samples is None else 0)
         sample[setup.samples[first:last] - self._slot] = indices
-        start = np.zeros(count)
-        # Only event rows need the times: a batch without them saves the loop.
-        if timed:
-            start = np.array([plant.slot_time(slot) for slot in slots.tolist()])
+        start = self._scenario.slot_plant.slot_times(slots)
         return SlotTimes(
             first=self._slot, start=start, recorded=recorded, sensed=sensed, exchanged=exchanged,
             sample=sample, predicts=algorithm.timing.predicts,
@@ -298,7 +294,7 @@ def slot_batch(scenario: Scenario, seed: int, replicas: range, fingerprint: bool
     events_hash = hashlib.sha256()
     while not runs.over:
         with np.errstate(over="ignore", invalid="ignore"):
-            block, _ = runs.following(max_events=0, timed=fingerprint)
+            block, _ = runs.following(max_events=0)
         runs.events.count(block)
         for rows in runs.events.rows_in_parts(block) if fingerprint else ():
             events_hash.update(rows.data)

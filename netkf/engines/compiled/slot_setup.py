@@ -105,7 +105,7 @@ class SlotSetup:
         # The slot at the horizon exists only to be sampled.
         self.slots = last + bool(len(self.samples) and self.samples[-1] >= last)
         self.last = last
-        self.sample_times = np.array([plant.slot_time(slot) for slot in self.samples.tolist()])
+        self.sample_times = plant.slot_times(self.samples)
 
     def _set_stages(self, scenario: Scenario) -> None:
         algorithm, phase, step = self.algorithm, 0, 0

@@ -42,7 +42,7 @@ class StepTimes(NamedTuple):
 def step_times(scenario: Scenario, setup: SlotSetup, first: int, count: int) -> StepTimes:
     """Return the times of ``count`` slots."""
     slots = np.arange(first, first + count)
-    start = np.array([scenario.slot_plant.slot_time(slot) for slot in slots.tolist()])
+    start = scenario.slot_plant.slot_times(slots)
     # The ends of steps are counted from the start of the slot.
     end = scenario.time_grid.snap(start[:, None] + setup.stages.end[setup.stages.step >= 0])
     begin = np.concatenate([start[:, None], end[:, :-1]], axis=1)[:, : end.shape[1]]
