@@ -110,11 +110,11 @@ def _sensing_delay(scenario: Scenario) -> float:
 
 def _known_response(scenario: Scenario, times: FloatArray) -> FloatArray:
     """Return the response (K, n) to the input that filters know at ``times`` (K,)."""
-    responses = scenario.input_responses
-    if responses is None or responses.believed is None:
+    believed = scenario.origin_response
+    if believed is None:
         return np.zeros((len(times), scenario.plant.n))
     slots = np.round(times / scenario.slot_plant.period).astype(int) if scenario.slotted else times
-    return np.asarray(responses.believed.states(slots))
+    return np.asarray(believed.states(slots))
 
 
 def _readings_of(

@@ -580,8 +580,7 @@ class DerivedScenario(ScenarioModel):
         """Return a ``truth`` with the states of blocks that are recorded or unknown in it."""
         if self.plant.is_random or not self.plant.draws:
             return truth
-        believed = None if self.input_responses is None else self.input_responses.believed
-        return PartlyDrawnTruth(truth, self.plant.record, believed, period)
+        return PartlyDrawnTruth(truth, self.plant.record, self.origin_response, period)
 
     @cached_property
     def unknown(self) -> np.ndarray:
@@ -630,6 +629,13 @@ class DerivedScenario(ScenarioModel):
         return InputResponses(self.believed_response if self._moves_along else None, surprise)
 
     @property
+    def origin_response(self) -> Response | None:
+        """The response that estimates and their readings are counted from, ``InputResponses``'
+        ``believed``; None where the origin of coordinates does not move with an input.
+        """
+        return None if self.input_responses is None else self.input_responses.believed
+
+    @property
     def _moves_along(self) -> bool:
         return self.knows_input and not self.tells_models
 
@@ -672,7 +678,7 @@ class DerivedScenario(ScenarioModel):
             # A state that is not known has no coordinates but those of the filters. One that passed
             # the largest number is not a number either, but it was known in its frame.
             return np.where(np.isnan(local), 0.0, x - local)
-        believed = self.input_responses.believed
+        believed = self.origin_response
         return np.zeros(x.shape) if believed is None else believed.states(times)
 
     @cached_property
@@ -820,10 +826,8 @@ class DerivedScenario(ScenarioModel):
 
     def _moves_readings(self, sensor: Sensor) -> Response | None:
         """Return the response that readings of the sensor depend on; None if on local states."""
-        responses = self.input_responses
-        if responses is None or (sensor.linear and sensor.is_random and sensor.fault is None):
-            return None
-        return responses.believed
+        is_local = sensor.linear and sensor.is_random and sensor.fault is None
+        return None if is_local else self.origin_response
 
     @property
     def filters_know_the_truth(self) -> bool:
@@ -906,10 +910,10 @@ class DerivedScenario(ScenarioModel):
 
     def fresh_estimate(self, node: int, when: float) -> tuple[FloatArray, FloatArray]:
         """Return ``initial_estimate`` of a node that begins again ``when`` (s or slot)."""
-        (mean, cov), responses = self.initial_estimate(node), self.input_responses
-        if responses is None or responses.believed is None:
+        mean, cov = self.initial_estimate(node)
+        if self.origin_response is None:
             return mean, cov
-        origin = responses.believed.states(np.array([when]))[0]
+        origin = self.origin_response.states(np.array([when]))[0]
         return mean - origin[self.model_view(self.topology.index[node])], cov
 
     def prior_shift(self, node: int, when: float) -> FloatArray:

@@ -195,8 +195,7 @@ def nonlinear_table(
     known, method = nonlinear_sensors(scenario), scenario.filter.linearise
     tables = known.setup.tables(method, 1)
     is_linear = np.array([one.linear for one, _, _ in known.sensors], dtype=bool)
-    responses = scenario.input_responses
-    believed = None if responses is None else responses.believed
+    believed = scenario.origin_response
     n, w, width = scenario.plant.n, known.columns.entries.shape[1], known.columns.width
     most = max(1, known.R.shape[1] * int(np.diff(instants["first"]).max(initial=1)))
     rows = linear_rows(1, most, np.full((1, width), -1))

@@ -103,7 +103,7 @@ def unquantised_messages(scenario: Scenario) -> str | None:
     kernels = scenario.node_filter.kernels
     if scenario.network.quantise is None or kernels is None:
         return None
-    if scenario.input_responses is not None and scenario.input_responses.believed is not None:
+    if scenario.origin_response is not None:
         return "messages of few bits beside an input that filters know"
     infos, models = scenario.node_infos, scenario.model_pieces[0]
     record = kernels.record_of(scenario.node_filter, infos, models)

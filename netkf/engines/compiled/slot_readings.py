@@ -123,10 +123,9 @@ class SlotReadings:
     ) -> None:
         """Add to the noise in ``y`` what sensors read at ``x`` that are not linear."""
         assert self.nonlinear is not None
-        responses = self._scenario.input_responses
-        if responses is not None and responses.believed is not None:
-            slots = np.arange(times.first, times.first + len(times.start))
-            origin = responses.believed.states(slots)
+        believed = self._scenario.origin_response
+        if believed is not None:
+            origin = believed.states(np.arange(times.first, times.first + len(times.start)))
             self.nonlinear.origin = self._drawn.origin = origin
             if self.pairs is not None:
                 self.pairs.rows.origin = origin
@@ -210,8 +209,7 @@ class SlotReadings:
         columns, pairs, h, p = self._setup.columns, self.pairs, s.estimator, len(s.R)
         assert pairs is not None
         sensor: Any = self._scenario.located_sensors[s.placed_sensor.entry]
-        responses = self._scenario.input_responses
-        believed = None if responses is None else responses.believed
+        believed = self._scenario.origin_response
         y[:, times.sensed, h, s.row : s.row + s.rows] = 0.0 if sensor.linear else np.nan
         for k in np.flatnonzero(times.sensed).tolist():
             for m, (values, anchor, R) in enumerate(path.readings_at(times.first + k, s.R)):

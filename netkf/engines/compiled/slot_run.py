@@ -103,7 +103,7 @@ class SlotRuns:
         times = self._next_times(count)
         messages = self._transmissions.messages(times)
         local, absolute, rebased = self._truth.states(self._slot, count)
-        drawn, responses = self._truth.is_drawn, self._scenario.input_responses
+        drawn, believed = self._truth.is_drawn, self._scenario.origin_response
         y, H = self._readings.draw(times, local, rebased)
         sampled = np.flatnonzero(times.sample >= 0)
         samples = self.samples if self.samples is not None else self._empty_samples(len(sampled))
@@ -117,9 +117,9 @@ class SlotRuns:
             entries=np.maximum(self.setup.entries, 0) if self.setup.views is not None else _ALL,
         )  # fmt: skip
         decided = self._simulate(times, messages, (y, H, rebased), kernel_samples)
-        if not drawn and responses is not None and responses.believed is not None:
+        if not drawn and believed is not None:
             # Recorded states may be unknown, where coordinates begin is not.
-            moved = responses.believed.states(times.first + sampled)[:, self.setup.entries]
+            moved = believed.states(times.first + sampled)[:, self.setup.entries]
             samples.xhat[:, times.sample[sampled]] += moved
         return SlotBlock(sampled, times, messages, *decided), samples
 

@@ -18,8 +18,7 @@ class PathStates:
     def __init__(self, scenario: Scenario, frame_times: FloatArray, path: PathBlock) -> None:
         self._moves, self._offsets = scenario.diffusion.moves, list[FloatArray]()
         self.frame_times, self.path = frame_times, path
-        responses = scenario.input_responses
-        self._believed = None if responses is None else responses.believed
+        self._believed = scenario.origin_response
 
     def local(self, times: FloatArray) -> FloatArray:
         """Return the states (R, T, n) at ``times`` (T,), relative to the origin of their frame."""

@@ -105,9 +105,8 @@ class _Simulation:
             # A pooled filter has the increment sensors of all nodes.
             placed = [(k, p) for k in sensing for p in scenario.increment_sensors.get(k, ())]
             sensors = increment_sensors(scenario, streams, placed)
-            clock, response = node_time(scenario, streams, node), None
-            if scenario.network.clocks and scenario.input_responses is not None:
-                response = scenario.input_responses.believed
+            clock = node_time(scenario, streams, node)
+            response = scenario.origin_response if scenario.network.clocks else None
             own = _node_arguments(scenario, node, entity, clock.shows(0.0))
             return ClockedNode(timeline, self._recorder, truth, sensors, clock, response, **own)
 
@@ -130,8 +129,8 @@ class _Simulation:
             self._transmitter.reach = Reach(self._scenario, truth, self._append)
 
     def _begin_origins(self, nodes: dict[int, Any]) -> None:
-        scenario, responses = self._scenario, self._scenario.input_responses
-        if responses is None or (believed := responses.believed) is None:
+        scenario, believed = self._scenario, self._scenario.origin_response
+        if believed is None:
             return
 
         def origin_at(sender: int, when: float) -> FloatArray:

@@ -109,13 +109,13 @@ class ClockColumns(LoggedColumns):
         """Return the response that estimates are counted from, as the clock of their node shows,
         and let nodes begin there; None if it is that of the truth.
         """
-        scenario, responses = self._scenario, self._scenario.input_responses
-        if responses is None or responses.believed is None or not self._clocks:
+        scenario, believed = self._scenario, self._scenario.origin_response
+        if believed is None or not self._clocks:
             return None
         for h, shown in enumerate(self._times):
             if shown != 0.0:
                 self._filters.restart(h, scenario.prior_shift(scenario.nodes[h], shown))
-        return responses.believed
+        return believed
 
     def _is_up(self, node: int, time: float) -> bool:
         lives = self._scenario.network.lives
