@@ -464,8 +464,7 @@ def _assumptions(scenario: Scenario) -> list[Assumption]:
             _delivery_probability(scenario, direction)
     except TheoryError as error:
         is_known, evidence = False, str(error)
-    # A derived class may choose its broadcasts in any way.
-    if type(scenario.network.activation) is not Broadcast:
+    if not isinstance(scenario.network.activation, Broadcast):
         is_known, evidence = False, "links are up as recorded"
     stated = "readings arrive independently, as often as stated"
     return [

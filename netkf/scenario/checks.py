@@ -36,7 +36,7 @@ from netkf.scenario.preconditions import (
     filter_name,
 )
 from netkf.scenario.records import check_records
-from netkf.scenario.registry import explain_time_mismatch, kind_name
+from netkf.scenario.registry import explain_time_mismatch, name_of
 from netkf.scenario.sampling import check_sampling, uses_grid
 from netkf.scenario.time_grid import check_grid
 
@@ -314,7 +314,7 @@ def _check_faults(scenario: DerivedScenario) -> None:
         if sensor.record is not None or not (scenario.slotted or takes_samples(sensor)):
             rule = "belongs to sensors whose readings are drawn, in slots or by sampling"
             remedy = "change the table, or write sampling = { ... }"
-            raise ScenarioError(key, rule, kind_name(fault, "fault"), remedy)
+            raise ScenarioError(key, rule, name_of("fault", fault), remedy)
         p = len(scenario.noise_covariance(k, believed=False))
         for name in ("value", "size", "rate"):
             value = getattr(fault, name, None)
@@ -513,7 +513,7 @@ def _check_slots(scenario: DerivedScenario) -> None:
     if is_matching != node_filter.timing.pairwise:
         assert activation is not None
         form = "matching" if node_filter.timing.pairwise else "broadcast"
-        given = kind_name(activation, "activation")
+        given = name_of("activation", activation)
         if recorded is not None:
             what = "slot,node,peer: a matching" if recorded.matching else "phase,step: broadcasts"
             given = f"{given} ({what})"

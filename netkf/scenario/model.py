@@ -60,7 +60,7 @@ from netkf.plants.faults import Fault
 from netkf.plants.linear import LinearPlant, SlotPlant
 from netkf.plants.nonlinear import NonlinearSensor, PositionedSensor
 from netkf.plants.plant import Plant
-from netkf.plants.sensors import LinearSensor, Sensor
+from netkf.plants.sensors import Sensor
 from netkf.scenario.block_sensors import (
     STACKED,
     estimated_blocks,
@@ -213,9 +213,9 @@ class PlacedSensor(NamedTuple):
 
 def takes_samples(sensor: Sensor) -> bool:
     """Return True if a sensor of a diffusion samples y = H x + v, False for increments."""
-    return sensor.record is not None or (
-        isinstance(sensor, (LinearSensor, NonlinearSensor)) and sensor.sampling is not None
-    )
+    own_times = type(sensor).sample_times not in (Sensor.sample_times, NonlinearSensor.sample_times)
+    has_clock = getattr(sensor, "sampling", None) is not None
+    return sensor.record is not None or has_clock or own_times
 
 
 _plant = dataclasses.replace(

@@ -26,7 +26,7 @@ from netkf.rng.streams import Streams
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.model import takes_samples
 from netkf.scenario.records import sensed_slots
-from netkf.scenario.registry import explain_time_mismatch, kind_name
+from netkf.scenario.registry import explain_time_mismatch, kind_name, name_of
 
 ANOTHER = 'use another filter, such as kind = "diffusion"'
 
@@ -46,7 +46,10 @@ def check_preconditions(scenario: DerivedScenario) -> None:
     if needs.linear_plant and not scenario.plant.linear:
         rule = "must be a filter that uses dynamics in predictions only; "
         rule += f"the {filter_name(scenario)} computes with F"
-        kind, remedy = kind_name(scenario.filter.algorithm), f"use a linear plant, or {ANOTHER}"
+        kind, remedy = (
+            name_of("filter", scenario.filter.algorithm),
+            f"use a linear plant, or {ANOTHER}",
+        )
         raise ScenarioError("filter.kind", rule, kind, remedy)
     if needs.fixed_sensors:
         _check_fixed_sensors(scenario)
@@ -201,7 +204,7 @@ def _check_fixed_sensors(scenario: DerivedScenario) -> None:
             varies = "H or R varies, or a value is missing" if irregular else "H varies"
             rule = f"must have a fixed H for the {filter_name(scenario)}, which computes with it "
             rule += "before there are readings"
-            value = f"kind {kind_name(sensor, 'sensor')!r}, whose {varies}"
+            value = f"kind {name_of('sensor', sensor)!r}, whose {varies}"
             remedy = f"use linear sensors, or {ANOTHER}"
             raise ScenarioError(scenario.sensor_key(k), rule, value, remedy)
 
@@ -324,10 +327,10 @@ def check_time(scenario: DerivedScenario) -> None:
         fits = bool(algorithm.timing.clocks) or not algorithm.timing.talks
     if not fits:
         rule = explain_time_mismatch(slotted)
-        raise ScenarioError("filter.kind", rule, kind_name(algorithm), remedy)
+        raise ScenarioError("filter.kind", rule, name_of("filter", algorithm), remedy)
     activation = scenario.network.activation
     if activation is not None and isinstance(activation, SlotActivation) != slotted:
-        kind = kind_name(activation, "activation")
+        kind = name_of("activation", activation)
         raise ScenarioError("network.activation.kind", explain_time_mismatch(slotted), kind, remedy)
 
 

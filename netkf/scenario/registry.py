@@ -292,7 +292,7 @@ def name_of(family: str, component: Component) -> str:
     return f"{type(component).__module__}:{type(component).__qualname__}"
 
 
-def kind_name(component: Component, family: str = "filter") -> str:
-    """Return the name of a component for messages: that in KINDS, else of its class."""
-    name = name_of(family, component)
-    return type(component).__name__.lower() if ":" in name else name
+def kind_name(algorithm: Filter) -> str:
+    """Return the name of a filter in sentences: that in KINDS, else of its class."""
+    name = name_of("filter", algorithm)
+    return type(algorithm).__name__.lower() if ":" in name else name

@@ -26,6 +26,7 @@ from netkf.rng.streams import Generators, Streams
 from netkf.scenario.block_sensors import support_of
 from netkf.scenario.model import PlacedSensor, ScenarioModel, takes_samples
 from netkf.scenario.positions import tick_times
+from netkf.scenario.registry import name_of
 
 MAX_SAMPLES = 1e9  # samples of one sensor; more suggest a wrong unit of time
 
@@ -135,13 +136,18 @@ def check_sampling(scenario: ScenarioModel) -> None:
     """Raise ScenarioError if sampling does not fit plant or graph, or recorded states miss."""
     for k, sensor in enumerate(scenario.sensors):
         key = scenario.sensor_key(k)
-        if isinstance(sensor, (LinearSensor, NonlinearSensor)):
-            if sensor.sampling is not None:
-                _check_clock(scenario, key, sensor)
-            elif not sensor.linear and not scenario.slotted and sensor.record is None:
-                rule = "is missing, and a nonlinear sensor takes samples in continuous time"
-                remedy = 'write sampling = { kind = "periodic", period = ... }'
-                raise ScenarioError(f"{key}.sampling", rule, None, remedy)
+        clock = getattr(sensor, "sampling", None)
+        if clock is not None:
+            _check_clock(scenario, key, sensor, clock)
+        elif not (scenario.slotted or takes_samples(sensor) or isinstance(sensor, LinearSensor)):
+            kind = "nonlinear" if isinstance(sensor, NonlinearSensor) else "custom"
+            rule = f"is missing, and a {kind} sensor takes samples in continuous time"
+            remedy = 'write sampling = { kind = "periodic", period = ... }'
+            raise ScenarioError(f"{key}.sampling", rule, None, remedy)
+        lacks_samples = type(sensor).samples is Sensor.samples
+        if not scenario.slotted and takes_samples(sensor) and lacks_samples:
+            rule = "must define samples, which a sensor has in continuous time"
+            raise ScenarioError(f"{key}.kind", rule, name_of("sensor", sensor), "write the method")
         has_increments = scenario.plant.is_random and scenario.plant.linear
         if not scenario.slotted and not has_increments and not takes_samples(sensor):
             kind = "recorded" if scenario.plant.linear else "nonlinear"
@@ -153,9 +159,7 @@ def check_sampling(scenario: ScenarioModel) -> None:
         require_states(scenario, sample_times(scenario, streams), streams)
 
 
-def _check_clock(scenario: ScenarioModel, key: str, sensor: LinearSensor | NonlinearSensor) -> None:
-    clock = sensor.sampling
-    assert clock is not None
+def _check_clock(scenario: ScenarioModel, key: str, sensor: Sensor, clock: Clock) -> None:
     if scenario.slotted:
         rule = "belongs to plants in continuous time, and this plant is in slots"
         remedy = "leave it out: there is a reading in every slot"

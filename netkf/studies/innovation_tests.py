@@ -195,7 +195,8 @@ def recorded_innovations(run: Run) -> Innovations:
     """Return the innovations of a run; raises NetkfError without any."""
     scenario = run.scenario
     exact = scenario.filter.gate is None and not scenario.network.clocks
-    if type(scenario.node_filter) is Central and exact:
+    central = scenario.node_filter
+    if isinstance(central, Central) and not overridden(central) and exact:
         try:
             return CentralModel(scenario, run.seed, run.replica).as_innovations()
         except ScenarioError:

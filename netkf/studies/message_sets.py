@@ -141,7 +141,7 @@ def delivering(scenario: Scenario, deliveries: Deliveries) -> Scenario:
     loss = DeliveringLoss(channel_of_run.loss, deliveries, channels=channel_of_run.channels)
     delay = channel_of_run.delay
     # Without delays no message is late, and the engines have a faster path.
-    if not isinstance(delay, NoDelay):
+    if type(delay) is not NoDelay:
         delay = DelayUnlessWaived(delay, deliveries)
     channel = Channel(loss=loss, delay=delay, symmetric=channel_of_run.symmetric)
     return _with(scenario, network=dataclasses.replace(network, channel=channel))

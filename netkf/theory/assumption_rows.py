@@ -141,7 +141,7 @@ def _sampling_rows(scenario: Scenario) -> list[AssumptionRow]:
     source = "derived, docs/poisson_samples.md"
     for node, placed_sensor in randomly_sampled_sensors(scenario):
         clock = sampling_clock(scenario.sensors[placed_sensor.entry])
-        if clock is not None and not clock.memoryless:
+        if clock is None or not clock.memoryless:
             evidence = f"node {node} samples by another random clock: the bound is not promised"
             return [(name, source, False, evidence)]
     return [(name, source, True, "the bound on the mean of P then has them")]

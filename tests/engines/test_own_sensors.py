@@ -1,14 +1,17 @@
 """Sensors that users write run in both engines alike, wherever Python can read them."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
 
 import netkf
-from netkf.network.clocks import Periodic
+from netkf.network.clocks import Periodic, Poisson, Renewal
+from netkf.parts import Cycle, covariance, matrix, setting
 from netkf.plants.sampling import DrawnSamples
 from netkf.plants.sensors import LinearSensor, Sensor
+from netkf.testing import check_sensor
 from tests.engines.agreement import assert_agree
 from tests.testing.sound_parts import Bearing, LaplaceSensor
 
@@ -118,6 +121,59 @@ def test_samples(clocks, cls):
     scenario = in_clocks(clocks, cls)
     run = assert_agree(scenario)
     assert (run.events["kind"] == "sense").any()
+
+
+class OneByOne:
+    """Samples of a fixed H; the least that is asked for."""
+
+    def __init__(self, sensor, random):
+        self.sensor, self.random, self.noise = sensor, random, []
+
+    def reading(self, k, x):
+        while len(self.noise) <= k:
+            self.noise.append(self.random.standard_normal(1))
+        return self.sensor.H @ x + np.sqrt(self.sensor.R[0]) * self.noise[k], self.sensor.H
+
+
+@dataclass(frozen=True, eq=False)
+class FromTheContract(Sensor):
+    H: np.ndarray = setting(matrix)
+    R: np.ndarray = setting(covariance)
+    sampling: Any = None
+
+    def slot_path(self, node, period, generator):
+        raise NotImplementedError
+
+    def samples(self, node, generator, horizon):
+        return OneByOne(self, generator("noise"))
+
+
+class AtItsTimes(FromTheContract):
+    def sample_times(self, node, ordinal, generator, horizon):
+        return np.arange(0.25, horizon, 0.5)
+
+
+def test_samples_of_a_sensor_that_derives_from_the_contract_alone(clocks):
+    ticking = FromTheContract(nodes=(3,), sampling=Poisson(rate=2.0), **ONE)
+    for sensor in (ticking, AtItsTimes(nodes=(3,), **ONE)):
+        scenario = clocks.replace({"sensors": [sensor]})
+        assert (assert_agree(scenario).events["kind"] == "sense").any()
+        assert netkf.check(scenario, runs=10)
+    with pytest.raises(netkf.ScenarioError, match="is missing, and a custom sensor takes samples"):
+        clocks.replace({"sensors": [FromTheContract(nodes=(3,), **ONE)]})
+    check_sensor(ticking)
+
+
+def test_theory_asks_when_a_sensor_from_the_contract_samples(clocks):
+    gamma = Renewal(distribution="gamma", shape=2.0, mean=0.5)
+    for sensor in (
+        FromTheContract(nodes=(3,), sampling=gamma, **ONE),
+        AtItsTimes(nodes=(3,), **ONE),
+    ):
+        hybrid = {"sensors": [sensor], "filter": {"kind": "hybrid", "epsilon": 0.02}}
+        hybrid["network"] = netkf.Network(graph=Cycle(4), activation=Poisson(rate=1.0))
+        with pytest.raises(netkf.TheoryError, match="samples is random and no Poisson process"):
+            netkf.theory.covariance_bound(clocks.replace(hybrid), [1.0])
 
 
 def test_increments_of_a_sensor_that_overrides_nothing_are_compiled():

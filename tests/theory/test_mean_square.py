@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from scipy.integrate import quad
 
 import netkf
-from netkf import theory
+from netkf import parts, theory
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.network.losses import Transmission
 from netkf.theory import mean_square
@@ -498,6 +499,43 @@ def test_increments_between_periodic_ticks(tmp_path):
     X11 = right / (1.0 - (1.0 - w) ** 2 * f11)
     found = theory.steady_error_covariance(scenario)
     np.testing.assert_allclose(found[:, 0, 0], [X00, X11], rtol=1e-10)
+
+
+@dataclass(frozen=True, eq=False)
+class OwnBursts(parts.Loss):
+    """The bursts above, by what a user's class states of them."""
+
+    stateful = True
+    chain = parts.Chain(BURSTS["to_bad"], BURSTS["to_good"], 0.9, 0.1)
+
+    def next_state(self, link, bad, random):
+        return bool(random.random() < (0.4 if bad is None else 0.7 if bad else 0.2))
+
+    def delivery_probability(self, sent):
+        return 0.1 if sent.bad else 0.9
+
+
+@dataclass(frozen=True, eq=False)
+class OwnTicks(parts.LinkClock):
+    gaps = parts.Lattice(0.5, 0.5)
+
+    def ticks(self, entity, origin, index, now, random, count):
+        return 0.5 * np.arange(index + 1, index + 1 + count)
+
+    def mean_rate(self, entity):
+        return 2.0
+
+
+def test_what_users_classes_state_is_what_built_in_ones_have(tmp_path):
+    bursty = slots(CONSTANT, tmp_path, CHANNELS["bursts"])
+    network = {"graph": PATH, "activation": {**EACH, "at": "nodes"}}
+    sampled = {**SENSOR, "sampling": EACH}
+    ticking = scenario_of(CONSTANT, tmp_path, plant=ROTATION, sensors=[sampled], network=network)
+    clocks = {"network.activation": OwnTicks(at="nodes"), "sensors[0].sampling": OwnTicks()}
+    for scenario, own in ((bursty, {"network.channel.loss": OwnBursts()}), (ticking, clocks)):
+        expected = theory.steady_error_covariance(scenario)
+        found = theory.steady_error_covariance(scenario.replace(own))
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
 # Refusals, and what netkf theory prints.

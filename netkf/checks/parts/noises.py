@@ -31,6 +31,7 @@ from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant, SlotPlant
 from netkf.plants.maps import NonlinearPlant
 from netkf.plants.nonlinear import NonlinearSensor
+from netkf.plants.readings import read_many
 from netkf.rng.normals import StreamNormals
 from netkf.rng.streams import Streams
 from netkf.scenario.model import PlacedSensor, takes_samples
@@ -267,7 +268,7 @@ def _whitened_noises(
         y = np.array([one[0] if isinstance(one, tuple) else one for one in readings], dtype=float)
         expected = np.array([sensor.h(state, node) for state in x], dtype=np.float64)
     else:
-        y, H = path.several(range(count), x)
+        y, H = read_many(path, range(count), x)
         expected = np.einsum("spn,sn->sp", H, x) if law.H is None else x @ law.H.T
     noises = np.asarray(np.linalg.solve(law.root, (y - expected).T).T, dtype=np.float64)
     return noises, _standardise(x, sizes)

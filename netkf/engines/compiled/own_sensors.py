@@ -14,6 +14,7 @@ from netkf.plants.readings import covariance_of, read_many
 from netkf.plants.recorded import RecordedSensor
 from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sensors import LinearSensor, Sensor
+from netkf.scenario.model import takes_samples
 
 BUILT_IN = (LinearSensor, RegressorSensor, RecordedSensor)
 METHODS = ("path", "slot_path", "samples", "matrix_of", "varying")
@@ -39,7 +40,7 @@ def reads_in_python(sensor: Sensor, slotted: bool) -> bool:
     if isinstance(sensor, NonlinearSensor):
         name = "slot_path" if slotted else "samples"
         return getattr(type(sensor), name) is getattr(NonlinearSensor, name)
-    return sensor.linear and (slotted or getattr(sensor, "sampling", None) is not None)
+    return sensor.linear and (slotted or takes_samples(sensor))
 
 
 def read_whitened(

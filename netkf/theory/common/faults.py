@@ -8,16 +8,16 @@ S = R and never follows. If no other sensor is bad, the filter of a node lies be
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
 
 from netkf.algorithms.gates import Gate
 from netkf.core.errors import TheoryError
+from netkf.core.laws import Lattice
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import noise_root
-from netkf.network.clocks import Periodic
 from netkf.plants.faults import Fault, Outliers
 from netkf.plants.transitions import Transitions
 from netkf.scenario.model import PlacedSensor
@@ -112,9 +112,9 @@ def _step(scenario: Scenario, placed: PlacedSensor) -> float | None:
     if scenario.slotted:
         return float(scenario.slot_plant.period)
     clock = getattr(scenario.sensors[placed.entry], "sampling", None)
-    if isinstance(clock, Periodic) and not clock.jitter and not clock.phase:
-        return float(clock.period)
-    return None
+    lattice: Any = getattr(clock, "gaps", None)
+    is_even = isinstance(lattice, Lattice) and lattice == Lattice(lattice.period, lattice.period)
+    return float(lattice.period) if is_even else None
 
 
 def _alone(scenario: Scenario, H: FloatArray, R: FloatArray, step: float) -> _Alone | None:

@@ -154,6 +154,7 @@ def directions_of(
     more than ``wait`` seconds are lost. Raises TheoryError without a known law.
     """
     loss, delay = scenario.network.channel.loss, _known_delay(scenario)
+    chain = loss.chain
     links, index = list(weights), scenario.topology.index
     # One draw decides about both directions of a link that are activated and lost together.
     together = scenario.network.one_fate
@@ -170,7 +171,7 @@ def directions_of(
         source,
         delivery,
         loss.fate_share if scenario.has_broadcasts else 0.0,
-        loss.transitions if isinstance(loss, GilbertElliott) and not loss.independent else None,
+        None if chain is None or loss.independent else (chain.to_bad, chain.to_good),
     )
 
 
@@ -192,8 +193,7 @@ def _known_delay(scenario: Scenario) -> float:
         raise TheoryError("exact mean squares are known for no delay or a fixed one, not a random")
     if not has_constant_losses(scenario):
         raise TheoryError("messages of one link are lost with different probabilities")
-    is_chain = isinstance(loss, GilbertElliott) and loss.chain is not None
-    if not (is_chain or loss.independent):
+    if loss.chain is None and not loss.independent:
         raise TheoryError("losses depend on earlier ones in a way that is not known here")
     if loss.state_of != "link":
         raise TheoryError("the links of a sender share their bursts, which is not known here")
@@ -282,15 +282,13 @@ def _deliveries(
 ) -> FloatArray:
     """Return the delivery probabilities (S, K) of ``links`` by mode of the bursty channels."""
     loss = scenario.network.channel.loss
-    if isinstance(loss, GilbertElliott) and loss.independent:
-        return np.array([[scenario.mean_delivery(link) for link in links]])
 
     def probabilities(bad: bool) -> FloatArray:
         """Return the probabilities (K,) if all channels are in their bad state, or good one."""
         sent = (scenario.transmission(link)._replace(bad=bad) for link in links)
         return np.array([float(loss.delivery_probability(one)) for one in sent])
 
-    if not isinstance(loss, GilbertElliott):
+    if loss.chain is None or loss.independent:
         return np.array([[delivery_of(scenario, link) for link in links]])
     if chains > MAX_CHAINS:
         raise TheoryError(

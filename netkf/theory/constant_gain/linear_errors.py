@@ -9,8 +9,9 @@ import numpy as np
 
 from netkf.core.clock import Clock
 from netkf.core.errors import TheoryError
+from netkf.core.laws import Lattice
 from netkf.linalg.arrays import FloatArray, block_diagonal, square_root, symmetric
-from netkf.network.clocks import LinkClock, Periodic
+from netkf.network.clocks import LinkClock
 from netkf.plants.transitions import Transitions
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.delayed_jumps import DelayedJumps
@@ -67,9 +68,10 @@ def clock_jumps(scenario: Scenario) -> ClockJumps | DelayedJumps | SlotJumps:
     clock = scenario.network.activation
     talks = bool(weights) and isinstance(clock, LinkClock)
     delay = scenario.network.channel.delay.fixed if talks else 0.0
-    if isinstance(clock, Periodic) and talks and delay is not None:
-        directions_of_tick = directions_of(scenario, weights, clock.period)
-        return _from_tick_to_tick(clock, (drifts, noise), samples, directions_of_tick, delay)
+    lattice = clock.gaps if isinstance(clock, LinkClock) and talks else None
+    if isinstance(lattice, Lattice) and delay is not None:
+        directions_of_tick = directions_of(scenario, weights, lattice.period)
+        return _from_tick_to_tick(lattice, (drifts, noise), samples, directions_of_tick, delay)
     directions = directions_of(scenario, weights, math.inf) if talks else None
     if delay and directions is not None and directions.modes > 1:
         raise TheoryError(
@@ -122,17 +124,17 @@ def _sampled_nodes(scenario: Scenario) -> list[SampledNode]:
 
 
 def _from_tick_to_tick(
-    clock: Periodic,
+    lattice: Lattice,
     flow: tuple[FloatArray, FloatArray],
     samples: list[SampledNode],
     directions: Directions,
     delay: float,
 ) -> SlotJumps:
     """Return the system from exchange to exchange of periodic clocks that tick together."""
-    _require_one_clock(clock, samples)
+    _require_one_clock(lattice, samples)
     drift, flow_noise = flow
     N, n, _ = drift.shape
-    if delay > 0.0 and (delay >= clock.period or not (drift == drift[0]).all()):
+    if delay > 0.0 and (delay >= lattice.period or not (drift == drift[0]).all()):
         raise TheoryError(
             "periodic clocks with a delay are known where it is below the period and sensors take "
             "samples"
@@ -143,7 +145,7 @@ def _from_tick_to_tick(
         sample_noise[_node_slice(sensor.node, n), _node_slice(sensor.node, n)] += sensor.noise
     # From the last arrival to the tick, its samples, and from there to the arrival of its messages.
     transitions = Transitions(block_diagonal(list(drift)), square_root(flow_noise))
-    (to_tick, to_arrival), roots = transitions.laws(np.array([clock.period - delay, delay]))
+    (to_tick, to_arrival), roots = transitions.laws(np.array([lattice.period - delay, delay]))
     tick_noise, arrival_noise = roots @ np.swapaxes(roots, 1, 2)
     C = block_diagonal(list(closed))
     noise = to_arrival @ (C @ tick_noise @ C.T + sample_noise) @ to_arrival.T + arrival_noise
@@ -154,15 +156,12 @@ def _from_tick_to_tick(
     return SlotJumps(np.eye(n), np.zeros((n, n)), steps, symmetric(noise), directions)
 
 
-def _require_one_clock(clock: Periodic, samples: list[SampledNode]) -> None:
+def _require_one_clock(lattice: Lattice, samples: list[SampledNode]) -> None:
     """Raise TheoryError unless all links tick together, and sensors sample then."""
-    if clock.jitter or isinstance(clock.phase, str):
+    if lattice.jitter or lattice.random_phase:
         raise TheoryError("periodic clocks are known where all tick together, without jitter")
     for sensor in samples:
-        sensor_clock, same_clock = sensor.clock, False
-        if isinstance(sensor_clock, Periodic) and not sensor_clock.jitter:
-            same_clock = (sensor_clock.period, sensor_clock.phase) == (clock.period, clock.phase)
-        if not same_clock:
+        if sensor.clock is None or sensor.clock.gaps != lattice:
             raise TheoryError("sensors do not sample at the ticks of the network's periodic clock")
 
 

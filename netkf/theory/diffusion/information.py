@@ -17,7 +17,6 @@ import numpy as np
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, square_root, symmetric
 from netkf.plants.regressors import RegressorSensor
-from netkf.plants.sensors import LinearSensor
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import require_every_reading
@@ -120,12 +119,13 @@ def _make_sources(scenario: Scenario) -> list[_Source]:
             if isinstance(sensor, RegressorSensor):
                 drive = sensor.B @ sensor.xi_cov @ sensor.B.T
                 sources.append(_Source(node, sensor.A, sensor.C, sensor.start, drive))
-            elif isinstance(sensor, LinearSensor):
+            elif sensor.is_random and not sensor.varying:
                 # A fixed row H is a regressor with the constant state 1 and no noise.
-                fixed = (np.ones(1), np.zeros((0, 0)))
-                sources += [_Source(node, np.eye(1), row[:, None], *fixed) for row in sensor.H]
+                fixed, H = (np.ones(1), np.zeros((0, 0))), sensor.matrix_of(scenario.plant.n)
+                sources += [_Source(node, np.eye(1), row[:, None], *fixed) for row in H]
             else:
-                raise TheoryError(f"the sensor of node {node} is a record, which has no law")
+                what = "is a record" if sensor.record is not None else "has an H that varies"
+                raise TheoryError(f"the sensor of node {node} {what}, which has no law")
     if not sources:
         raise TheoryError("no node has a sensor")
     return sources

@@ -165,7 +165,7 @@ def _reason_of_samples(scenario: Scenario) -> str | None:
         return f"not promised: {evidence}"
     for node, placed_sensor in randomly_sampled_sensors(scenario):
         clock = sampling_clock(scenario.sensors[placed_sensor.entry])
-        if clock is not None and not clock.memoryless:
+        if clock is None or not clock.memoryless:
             return (
                 f"not promised: when node {node} samples is random and no Poisson process, and for "
                 "other clocks of the same rate the mean covariance can lie above the bound"

@@ -12,10 +12,11 @@ import numpy as np
 import scipy
 
 from netkf.core.clock import Clock
+from netkf.core.laws import Lattice
 from netkf.linalg.arrays import FloatArray
-from netkf.network.clocks import LinkClock, Periodic
+from netkf.network.clocks import LinkClock
 from netkf.plants.sampling import RecordedSampling
-from netkf.plants.sensors import LinearSensor, Sensor
+from netkf.plants.sensors import Sensor
 from netkf.rng.streams import Streams
 from netkf.scenario.model import PlacedSensor
 from netkf.scenario.scenario import Scenario
@@ -77,17 +78,18 @@ class SampleJump(NamedTuple):
 
 
 def sampling_clock(sensor: Sensor) -> Clock | None:
-    """Return a sensor's sampling clock, or None for increment sensors and recorded ones."""
-    return sensor.sampling if isinstance(sensor, LinearSensor) else None
+    """Return a sensor's sampling clock, or None without one."""
+    return getattr(sensor, "sampling", None)
 
 
 def has_known_times(sensor: Sensor) -> bool:
     """Return True if the times of a sampled sensor are known before a run."""
     clock = sampling_clock(sensor)
-    if clock is None or isinstance(clock, RecordedSampling):
+    if sensor.record is not None or isinstance(clock, RecordedSampling):
         return True
     # A periodic clock without jitter and with a given phase ticks at known times.
-    return type(clock) is Periodic and clock.jitter == 0.0 and not isinstance(clock.phase, str)
+    law = None if clock is None else clock.gaps
+    return isinstance(law, Lattice) and not (law.jitter or law.random_phase)
 
 
 def randomly_sampled_sensors(scenario: Scenario) -> list[tuple[int, PlacedSensor]]:

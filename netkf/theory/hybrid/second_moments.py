@@ -16,7 +16,7 @@ import scipy
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, block_diagonal, row_units
-from netkf.network.clocks import Poisson
+from netkf.network.clocks import LinkClock
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import no_channel_law
 from netkf.theory.common.jumps import ClockJumps
@@ -31,9 +31,10 @@ def second_moment_rate(scenario: Scenario) -> float:
     the mean of P hold. Raises TheoryError but for Poisson clocks, independent losses, no delay.
     """
     channel = scenario.network.channel
-    if not isinstance(scenario.network.activation, Poisson):
+    clock = scenario.network.activation
+    if not (isinstance(clock, LinkClock) and clock.memoryless):
         raise TheoryError("the second moments of P are known for Poisson clocks only")
-    if scenario.network.activation.at != "links" or scenario.sampled_sensors:
+    if clock.at != "links" or scenario.sampled_sensors:
         raise TheoryError("the second moments of P are known for clocks of links and increments")
     if scenario.network_changes:
         raise TheoryError(no_channel_law(scenario))
