@@ -236,13 +236,13 @@ class Why:
             others = f" and {count_phrase(more, 'other')} before" if more > 0 else ""
             yield f"It last heard {_join_with_and(parts)}{others} (times of sending)."
         if silent:
-            yield f"It had never heard node {_list_items(silent)}."
+            yield f"It had never heard node {list_items(silent)}."
         unheard = sum(s.unheard for s in neighbours)
         if unheard:
             counts = [f"{s.unheard} of node {s.node}" for s in neighbours if s.unheard]
             verb = "message sent to it since then was"
             verb = verb if unheard == 1 else "messages sent to it since then were"
-            listed = _list_items(counts, "other node")
+            listed = list_items(counts, "other node")
             yield f"{unheard} {verb} lost, late or not used: {listed}."
 
     def _reading_sentences(self) -> Iterator[str]:
@@ -257,7 +257,7 @@ class Why:
             prefix = "The oldest of its" if len(known) > MAX_LISTED else "Its"
             yield f"{prefix} newest readings are {_join_with_and(parts)}."
         if without_reading:
-            nodes = _list_items([s.node for s in without_reading])
+            nodes = list_items([s.node for s in without_reading])
             yield f"No reading of node {nodes} can have reached it."
         yield from self._missed_reading_sentences(known + without_reading)
 
@@ -402,7 +402,7 @@ def _format_route(source: InformationSource) -> str:
     return " -> ".join(map(str, nodes))
 
 
-def _list_items(items: Sequence[object], other: str = "other") -> str:
+def list_items(items: Sequence[object], other: str = "other") -> str:
     """Return the first MAX_LISTED items joined, and the number of each ``other``."""
     parts = [str(item) for item in items[:MAX_LISTED]]
     more = len(items) - len(parts)

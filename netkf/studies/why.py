@@ -15,7 +15,14 @@ from netkf.ensembles.stored import StoredEnsemble
 from netkf.network.deliveries import MessageKey
 from netkf.runs.outcomes import downtimes
 from netkf.scenario.scenario import Scenario
-from netkf.studies.explanation import GOOD_ENOUGH, InformationSource, Missing, WhatIf, Why
+from netkf.studies.explanation import (
+    GOOD_ENOUGH,
+    InformationSource,
+    Missing,
+    WhatIf,
+    Why,
+    list_items,
+)
 from netkf.studies.information import (
     NEVER,
     OUTCOMES,
@@ -304,7 +311,8 @@ def _make_what_ifs(
     replayed = set(sorted(newer, key=time_gained, reverse=True)[:count])
     for keys, sources_of_keys in newer.items():
         if keys in replayed:
-            nodes = ", ".join(str(source.node) for source in sources_of_keys)
+            # Nodes of different keys differ, so that a label names one set.
+            nodes = list_items([source.node for source in sources_of_keys])
             delivered_sets.append((f"newer readings of node {nodes}", keys))
     if len(newer) > 1:
         together = tuple(sorted({key for keys in newer for key in keys}))

@@ -484,6 +484,20 @@ def test_who_is_not_named_is_counted(build, nodes, told):
     assert told in str(why(netkf.simulate(scenario), 1, 2.0))
 
 
+def test_many_nodes_whose_readings_one_message_brings_are_counted(build):
+    """Labels of replays named all of them: lines of a thousand nodes were thousands wide."""
+    clock, sampling = {"kind": "poisson", "at": "nodes", "rate": 3.0}, SAMPLED[0]["sampling"]
+    graph, channel = {"kind": "star", "nodes": 12}, {"loss": HALF}
+    network = {"graph": graph, "activation": clock, "channel": channel}
+    sensors = [{"nodes": [*range(12)], "H": [[1.0]], "R": [[0.5]], "sampling": sampling}]
+    intersection = {"kind": "covariance-intersection", "epsilon": 0.05}
+    scenario = build(network=network, sensors=sensors, filter=intersection, seed=2)
+    labels = [what_if.label for what_if in why(netkf.simulate(scenario), 2, 2.5).what_ifs]
+    assert any(label.endswith("others") for label in labels)
+    assert len(set(labels)) == len(labels)
+    assert max(map(len, labels)) < 60
+
+
 @pytest.mark.parametrize(("kind", "known"), [("local", {1}), ("central", {0, 1})])
 def test_filters_that_do_not_talk_have_no_missing_messages(build, kind, known):
     sensors = [{"nodes": [0, 1], "H": [[1.0]], "R": [[0.5]]}]
