@@ -177,15 +177,13 @@ def bound_traces(scenario: Scenario) -> FloatArray:
         raise TheoryError("Tanwani's H(12) is about filters in continuous time")
     require_linear(scenario)
     _require_fixed_H(scenario)
-    # A pooled filter has the readings of all nodes.
-    pooled = scenario.filter.algorithm.timing.pooled
-    entities = [0] * len(scenario.nodes) if pooled else range(len(scenario.nodes))
     starts = [scenario.initial_estimate(node)[1] for node in scenario.nodes]
-    covariances = (_slot_covariances(scenario, k, P) for k, P in zip(entities, starts, strict=True))
-    columns = [
-        traces(P[:, scenario.view(k)][:, :, scenario.view(k)] if pooled else P)
-        for k, P in enumerate(covariances)
-    ]
+    if scenario.filter.algorithm.timing.pooled:  # one filter has the readings of all nodes
+        P = _slot_covariances(scenario, 0, starts[0])
+        views = [scenario.view(k) for k in range(len(starts))]
+        columns = [traces(P[:, view][:, :, view]) for view in views]
+    else:
+        columns = [traces(_slot_covariances(scenario, k, P)) for k, P in enumerate(starts)]
     return time_average(scenario, np.stack(columns, axis=1))
 
 

@@ -261,6 +261,44 @@ def test_filters_that_do_not_talk_have_their_own_covariance_as_bound(build):
     np.testing.assert_allclose(run.P[:, 0], run.P[:, 1], rtol=0)
 
 
+@pytest.mark.parametrize("sampling", [None, "periodic", "poisson"])
+def test_a_filter_of_all_nodes_is_that_of_a_node_with_all_sensors(build, sampling):
+    """It was solved once for each node, from readings stacked: minutes for a thousand sensors; and
+    constant gains were those of each node's own sensors.
+    """
+    plant = {"kind": "diffusion", "A": [[0.0, 1.0], [0.0, -0.1]], "B": [[0.0], [1.0]]}
+    law = {"periodic": {"period": 0.5}, "poisson": {"rate": 2.0}}.get(sampling)
+    clock = {} if law is None else {"sampling": {"kind": sampling, **law}}
+    rows = [{"H": [[1.0, 0.1 * k]], "R": [[1.0 + k]], **clock} for k in range(5)]
+    both = []
+    for kind, nodes in (("central", range(5)), ("local", [0] * 5)):
+        sensors = [{"nodes": [node], **row} for node, row in zip(nodes, rows, strict=True)]
+        network = {"graph": {"kind": "cycle", "nodes": 5}, "activation": {"kind": "poisson"}}
+        network["activation"]["rate"] = 1.0
+        made = {"plant": {**plant, "cov": np.eye(2).tolist()}, "sensors": sensors}
+        both.append(build(**made, network=network, filter={"kind": kind}))
+    central, local = both
+    found, at_0 = theory.covariance_bound(central, central.times), np.zeros(5, dtype=int)
+    np.testing.assert_allclose(found, theory.covariance_bound(local, local.times)[:, at_0], 1e-9)
+    if sampling != "poisson":
+        np.testing.assert_allclose(found, netkf.simulate(central).P, rtol=1e-8)
+    if sampling is None:
+        gains = [np.array([[0.3], [0.1]]) @ np.ones((1, 5)) / (1.0 + np.arange(5))]
+        alone = [*gains, *[np.zeros((2, 0))] * 4]
+        steady = theory.constant_gain_bound(central, gains=gains)
+        A = central.plant.A - gains[0] @ np.concatenate([row["H"] for row in rows])
+        R = np.diag(1.0 + np.arange(5))
+        Q = central.plant.Q + gains[0] @ R @ gains[0].T
+        plain = scipy.linalg.solve_continuous_lyapunov(A, -Q)
+        np.testing.assert_allclose(steady, np.broadcast_to(plain, (5, 2, 2)), rtol=1e-9)
+        constant = theory.constant_gain_bound(central, [0.5, 2.0], gains)
+        other = theory.constant_gain_bound(local, [0.5, 2.0], alone)
+        np.testing.assert_allclose(constant, other[:, at_0], rtol=1e-9)
+    if sampling != "periodic":
+        steady = theory.steady_covariance_bound(central)
+        np.testing.assert_allclose(steady[0], theory.covariance_bound(central, [80.0])[0, 0], 1e-7)
+
+
 @pytest.mark.parametrize(("a", "eps"), [(0.5, 0.5), (0.3, 0.2), (1.0, 1.0)])
 def test_threshold_of_one_blind_node(build, a, eps):
     """lambda > 2 a / eps, whatever the noises."""

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from netkf.algorithms.kernels.root_flow import whiten_observation
 from netkf.linalg.arrays import FloatArray, as_kernel_array, block_diagonal
 from netkf.plants.readings import covariance_of
 from netkf.rng.streams import Streams
@@ -39,6 +40,17 @@ def stack_observations(observations: list[Observation], n: int) -> Observation:
     H = np.concatenate([np.zeros((0, n)), *(observation.H for observation in observations)])
     R, root = (block_diagonal([observation[k] for observation in observations]) for k in (1, 2))
     return Observation(H, R, root)
+
+
+def stack_information(observations: list[Observation], n: int) -> Observation:
+    """Join ``observations`` as ``stack_observations``, with n rows of the same H' R^-1 H instead of
+    more: for covariances alone.
+    """
+    if sum(len(observation.H) for observation in observations) <= n:
+        return stack_observations(observations, n)
+    rows = [whiten_observation(observation.H, observation.R) for observation in observations]
+    eye = np.eye(n)
+    return Observation(np.asarray(np.linalg.qr(np.concatenate(rows), mode="r")), eye, eye)
 
 
 def joseph_update(P: FloatArray, observation: Observation) -> FloatArray:
@@ -91,6 +103,19 @@ def increment_observations(scenario: Scenario) -> list[Observation]:
     return observations
 
 
+def _joining_changes(join: Callable[..., Any], n: int) -> Callable[[int, list[Observation]], Any]:
+    """Return a function that joins the readings of an estimator, anew only where they change."""
+    joined: dict[int, tuple[list[Observation], Any]] = {}
+
+    def join_readings(estimator: int, readings: list[Observation]) -> Any:
+        known = joined.get(estimator)
+        if known is None or not _are_the_same(known[0], readings):
+            known = joined[estimator] = readings, join(readings, n)
+        return known[1]
+
+    return join_readings
+
+
 def _are_the_same(some: list[Observation], others: list[Observation]) -> bool:
     return len(some) == len(others) and all(
         a is b
@@ -119,7 +144,7 @@ def slot_observations(
         for nodes in nodes_by_estimator(scenario)
     ]
 
-    stacked: dict[int, tuple[list[Observation], Any]] = {}
+    join_readings = _joining_changes(join, n)
 
     def observe(slot: int) -> dict[int, Any]:
         """Return the readings of ``slot``, H (p, n) and R (p, p), by index of the estimator."""
@@ -134,11 +159,8 @@ def slot_observations(
                 for node, sensor, path, H in rows
                 if len(H) and is_up(node, slot)
             ]
-            # Sensors that do not vary have the same matrices in all slots, stacked once.
-            known = stacked.get(estimator)
-            if known is None or not _are_the_same(known[0], readings):
-                known = stacked[estimator] = readings, join(readings, n)
-            observations[estimator] = known[1]
+            # Sensors that do not vary have the same matrices in all slots.
+            observations[estimator] = join_readings(estimator, readings)
         return observations
 
     return observe
@@ -175,7 +197,8 @@ def timed_observations(
                     at_time = observations.setdefault(time, {}).setdefault(estimator, [])
                     if is_up(node, time):
                         at_time.append(reading)
+    join_readings = _joining_changes(join, n)
     return {
-        time: {estimator: join(readings, n) for estimator, readings in at_time.items()}
-        for time, at_time in observations.items()
+        time: {estimator: join_readings(estimator, readings) for estimator, readings in own.items()}
+        for time, own in observations.items()
     }

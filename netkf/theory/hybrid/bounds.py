@@ -22,7 +22,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.observations import joseph_update
-from netkf.theory.hybrid.coupled import CoupledRiccati, coupled_riccati
+from netkf.theory.hybrid.coupled import CoupledRiccati, at_nodes, coupled_riccati
 from netkf.theory.hybrid.packed import PackedRiccati
 from netkf.theory.numerics.matrices import as_times
 
@@ -72,7 +72,7 @@ def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
         P = packed.unpack(_solve_coupled(packed, instants))
     if not np.abs(P).max() < OVERFLOW:
         raise TheoryError(f"Tanwani's H(12) grows beyond {OVERFLOW:g} before {instants[-1]:g} s")
-    return P
+    return at_nodes(scenario, P)
 
 
 def _bound_over_pieces(scenario: Scenario, times: FloatArray) -> FloatArray:

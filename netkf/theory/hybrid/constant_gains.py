@@ -17,7 +17,8 @@ import scipy
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import ArrayLike, FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.hybrid.coupled import coupled_riccati
+from netkf.theory.common.observations import increment_observations
+from netkf.theory.hybrid.coupled import at_nodes, coupled_riccati
 from netkf.theory.hybrid.linearised import is_stable, solve_map
 from netkf.theory.hybrid.packed import LinearisedRiccati, PackedRiccati
 from netkf.theory.hybrid.steady import steady_covariance_bound
@@ -34,7 +35,8 @@ def constant_gain_bound(
     links, at T ``times``, which H(12) would be with constant ``gains``.
 
     times : (T,) in seconds, increasing; for None the steady state (N, n, n) is returned
-    gains : L_i (n, p_i) for each of N nodes; by default those of the steady state of H(12)
+    gains : L_i (n, p_i) for each of N nodes, or for the one filter of all; by default those of the
+            steady state of H(12)
 
     The bound is the mean of P_i itself if every node uses its L_i (derived). Raises TheoryError for
     sampled sensors, delays and wrong shapes, and if there is no steady state.
@@ -44,7 +46,7 @@ def constant_gain_bound(
     if times is None:
         if not is_stable(linear):
             raise TheoryError("constant gains do not stabilise the filters: no steady state")
-        return np.asarray(packed.unpack(solve_map(linear, constant)) * scale)
+        return at_nodes(scenario, packed.unpack(solve_map(linear, constant)) * scale)
     moments = as_times(times)
     # An entry that stays 1 makes the constant term part of a linear map.
     column = scipy.sparse.csc_array(constant.reshape(-1, 1))
@@ -65,7 +67,7 @@ def constant_gain_bound(
         if not np.isfinite(y).all():
             raise TheoryError(f"the bound overflows within {gap:g} s: give earlier times")
         bounds.append(packed.unpack(y[:-1].reshape(constant.shape)) * scale)
-    return np.array(bounds)
+    return at_nodes(scenario, np.array(bounds))
 
 
 def _linear_equation(
@@ -78,13 +80,15 @@ def _linear_equation(
     if equations.samples or equations.jumps or equations.delay:
         raise TheoryError("constant gains are for sensors in continuous time and no delay")
     n = len(equations.A)
-    observations = [scenario.observation_matrices(node, believed=True) for node in scenario.nodes]
+    observations = [(o.H, o.R) for o in increment_observations(scenario)]
     if gains is None:
-        P = steady_covariance_bound(scenario)
+        P = steady_covariance_bound(scenario)[: len(observations)]
         gains = [p @ np.linalg.solve(R, H).T for p, (H, R) in zip(P, observations, strict=True)]
     gain_matrices = [as_numbers("gains", L) for L in as_list("gains", gains)]
     if [L.shape for L in gain_matrices] != [(n, len(H)) for H, _ in observations]:
-        raise TheoryError("gains must have one (n, p_i) array for each node")
+        shared = len(observations) < len(scenario.nodes)
+        whose = "the filter of all nodes" if shared else "each node"
+        raise TheoryError(f"gains must have one (n, p_i) array for {whose}")
     equations, units = equations.in_natural_units()
     pairs = [
         (L / units[:, None], (H * units, R))

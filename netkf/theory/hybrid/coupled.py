@@ -49,7 +49,7 @@ RESIDUAL_TOLERANCE = 1e-9  # of the left null vector, relative
 
 
 class CoupledRiccati(NamedTuple):
-    """Coefficients of H(12) for N nodes of n states.
+    """Coefficients of H(12) for N nodes of n states, or for the one filter that they share.
 
     A, Q     : (n, n) drift and noise that the filters assume
     G        : (N, n, n) information of increments per second
@@ -181,17 +181,26 @@ def require_bound(scenario: Scenario) -> None:
 
 
 def increment_informations(scenario: Scenario) -> FloatArray:
-    """Return ``H_i' R_i^-1 H_i`` (N, n, n) of increments; a pooled filter has all of them."""
+    """Return ``H_i' R_i^-1 H_i`` (N, n, n) of increments; (1, n, n) of a pooled filter."""
     informations = [o.H.T @ np.linalg.solve(o.R, o.H) for o in increment_observations(scenario)]
-    if scenario.filter.algorithm.timing.pooled:
-        informations = informations * len(scenario.nodes)
     return np.stack(informations)
+
+
+def at_nodes(scenario: Scenario, P: FloatArray) -> FloatArray:
+    """Return the covariances (..., N, n, n) of the nodes, of those that H(12) gives."""
+    # All nodes have that of a pooled filter.
+    pooled = scenario.filter.algorithm.timing.pooled
+    return np.repeat(P, len(scenario.nodes), axis=-3) if pooled else P
 
 
 @lru_cache(maxsize=4)
 def coupling(scenario: Scenario) -> SparseOrFull:
-    """Return c (N, N): rates (1/s) of arrivals from j at i times weights; one object."""
+    """Return c (N, N): rates (1/s) of arrivals from j at i times weights; one object. The one
+    filter of all nodes has c = 0 (1, 1).
+    """
     index, size = scenario.topology.index, len(scenario.nodes)
+    if scenario.filter.algorithm.timing.pooled:
+        return full_matrix(1, 1)
     rates = {} if transmits_at_samples(scenario) else scenario.effective_rates()
     # Losses thin the Poisson process of arrivals: the effective rate counts what arrives.
     heard = {pair: rate for pair, rate in rates.items() if rate > 0.0}
@@ -213,14 +222,14 @@ def coupled_riccati(scenario: Scenario) -> CoupledRiccati:
     if delay > 0.0:
         (T,), (root,) = Transitions(A, square_root(Q)).laws(np.array([delay]))
         q = root @ root.T
-    spread = scenario.initial_estimate(scenario.nodes[0])[1]
-    start = np.broadcast_to(spread, (len(scenario.nodes), n, n)).copy()
-    if isinstance(scenario.filter.cov, tuple):
+    G, spread = increment_informations(scenario), scenario.initial_estimate(scenario.nodes[0])[1]
+    start = np.broadcast_to(spread, G.shape).copy()
+    if isinstance(scenario.filter.cov, tuple) and len(G) > 1:
         start = np.stack([scenario.initial_estimate(node)[1] for node in scenario.nodes])
     return CoupledRiccati(
         A,
         Q,
-        G=increment_informations(scenario),
+        G=G,
         coupling=coupling(scenario),
         T=T,
         q=q,

@@ -20,7 +20,12 @@ from netkf.plants.sensors import Sensor
 from netkf.rng.streams import Streams
 from netkf.scenario.model import PlacedSensor
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.observations import Observation, timed_observations
+from netkf.theory.common.observations import (
+    Observation,
+    nodes_by_estimator,
+    stack_information,
+    timed_observations,
+)
 from netkf.theory.hybrid.dense import FullMatrix, SparseOrFull, full_matrix, matrix_of
 
 MAX_FULL = 100  # nodes up to which weights are a full matrix
@@ -119,8 +124,8 @@ def _mean_link_weights(scenario: Scenario) -> SparseOrFull:
 
 def poisson_samples(scenario: Scenario) -> tuple[PoissonSamples, ...]:
     """Return all sensors with Poisson clocks, in groups of equal numbers p of rows."""
-    index, size = scenario.topology.index, len(scenario.nodes)
-    pooled = scenario.filter.algorithm.timing.pooled
+    index, estimators = scenario.topology.index, nodes_by_estimator(scenario)
+    estimator_of = {node: k for k, nodes in enumerate(estimators) for node in nodes}
     entries_by_rows: dict[int, list[tuple[int, FloatArray, FloatArray, float, int]]] = {}
     for node, placed_sensor in randomly_sampled_sensors(scenario):
         sensor = scenario.sensors[placed_sensor.entry]
@@ -128,15 +133,13 @@ def poisson_samples(scenario: Scenario) -> tuple[PoissonSamples, ...]:
         assert clock is not None
         rate = clock.mean_rate((node, placed_sensor.ordinal))
         R = scenario.noise_covariance(placed_sensor.entry, believed=True)
-        # All nodes have the covariance of a pooled filter, which uses the readings of each.
-        for reader in range(size) if pooled else [index[node]]:
-            entry = (reader, np.asarray(sensor.H), R, rate, index[node])
-            entries_by_rows.setdefault(len(R), []).append(entry)
+        entry = (estimator_of[node], np.asarray(sensor.H), R, rate, index[node])
+        entries_by_rows.setdefault(len(R), []).append(entry)
     groups, weights = [], _mean_link_weights(scenario)
     for entries in entries_by_rows.values():
         nodes, H, R, rates = (np.array([entry[k] for entry in entries]) for k in range(4))
         senders = [entry[4] for entry in entries]
-        heard: Any = weights[:, senders] * rates
+        heard: Any = weights[: len(estimators), senders] * rates
         if not isinstance(heard, FullMatrix):
             heard = scipy.sparse.csr_array(heard)
         groups.append(PoissonSamples(nodes, H, R, rates, heard))
@@ -149,6 +152,7 @@ def sample_jumps(scenario: Scenario) -> tuple[SampleJump, ...]:
     by_time = timed_observations(
         scenario,
         Streams(scenario.seed),
+        join=stack_information,
         chosen=lambda placed: has_known_times(scenario.sensors[placed.entry]),
     )
     jumps, nodes = [], range(len(scenario.nodes))
@@ -156,7 +160,5 @@ def sample_jumps(scenario: Scenario) -> tuple[SampleJump, ...]:
     for time, observations in sorted(by_time.items()):
         sends = np.isin(nodes, list(observations))
         weights = (link_weights * sends).toarray() if link_weights.nnz else None
-        pooled = scenario.filter.algorithm.timing.pooled
-        used = dict.fromkeys(nodes, observations[0]) if pooled else observations
-        jumps.append(SampleJump(time, used, weights))
+        jumps.append(SampleJump(time, observations, weights))
     return tuple(jumps)

@@ -25,7 +25,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.spectra import growth_rate
 from netkf.network.spectra import connected_parts
 from netkf.scenario.scenario import Scenario
-from netkf.theory.hybrid.coupled import CoupledRiccati, coupled_riccati
+from netkf.theory.hybrid.coupled import CoupledRiccati, at_nodes, coupled_riccati
 from netkf.theory.hybrid.dense import FullMatrix
 from netkf.theory.hybrid.linearised import is_stable, solve_map
 from netkf.theory.hybrid.packed import PackedRiccati
@@ -55,7 +55,7 @@ def steady_covariance_bound(scenario: Scenario) -> FloatArray:
     P = _steady_state_of(scenario)
     if P is None:
         raise TheoryError(_no_steady_state(scenario, coupled_riccati(scenario)))
-    return P.copy()
+    return at_nodes(scenario, P).copy()
 
 
 def has_steady_state(scenario: Scenario) -> bool:
@@ -67,7 +67,8 @@ def has_steady_state_near(scenario: Scenario, P: FloatArray) -> bool:
     """Return the same, in fewer steps if P (N, n, n) is near it, such as the bound at some time."""
     # The search takes covariances that are positive definite.
     first = P + 1e-6 * np.abs(P).max() * np.eye(P.shape[-1])
-    return steady_state(coupled_riccati(scenario), first) is not None
+    equations = coupled_riccati(scenario)
+    return steady_state(equations, first[: len(equations.G)]) is not None
 
 
 @lru_cache(maxsize=8)
@@ -91,7 +92,7 @@ def steady_by_node(scenario: Scenario) -> FloatArray:
         raise TheoryError("the nodes hear each other: their steady state is one for all")
     states = [steady_state(equations.restrict(i)) for i in range(len(equations.G))]
     no_state = np.full_like(equations.A, np.nan)
-    return np.stack([no_state if P is None else P[0] for P in states])
+    return at_nodes(scenario, np.stack([no_state if P is None else P[0] for P in states]))
 
 
 def steady_state(equations: CoupledRiccati, first: FloatArray | None = None) -> FloatArray | None:
