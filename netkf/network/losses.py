@@ -396,13 +396,12 @@ class GilbertElliott(Loss):
         links = list(zip(table.integers("sender"), table.integers("receiver"), strict=True))
         columns = [name for name in _CHAIN if name in table]
         chains: dict[Link, GilbertElliott] = {}
-        rows = list(zip(*(table[name].tolist() for name in columns), strict=True))
-        rows = rows or [()] * len(links)
+        rows = [[float(table[name][k]) for name in columns] for k in range(len(links))]
         rule = "a direction must have one chain"
         first_row = first_rows(table, links, rows, rule)
         for link, row in first_row.items():
             try:
-                values: dict[str, Any] = {name: float(table[name][row]) for name in columns}
+                values: dict[str, Any] = dict(zip(columns, rows[row], strict=True))
                 chains[link] = GilbertElliott(**values, shared=self.shared)
             except ScenarioError as error:
                 rule = f"{table.where(row)}: {error.key} {error.rule}"

@@ -395,6 +395,11 @@ REFUSALS = {
         "sender,receiver,mean_loss,mean_burst\n0,1,0.9,1\n",
         "s.csv line 2: mean_burst is too short",
     ),
+    "chains without numbers": (
+        'loss = { kind = "gilbert-elliott", path = "s.csv" }',
+        "sender,receiver\n0,1\n1,0\n",
+        "s.csv line 2: to_bad is missing",
+    ),
     "other transitions": (
         'loss = { kind = "gilbert-elliott", path = "s.csv", shared = true, mean_loss = 0.1, '
         "mean_burst = 2.0 }",

@@ -1,5 +1,6 @@
 """H(12) and its steady state against closed forms and plain integrations."""
 
+import functools
 import re
 
 import numpy as np
@@ -251,7 +252,18 @@ def test_a_short_delay_is_integrated_in_longer_stretches(build):
     np.testing.assert_allclose((short - none) / 1e-3, (bound(2e-3) - none) / 2e-3, rtol=0.01)
 
 
-def test_filters_that_do_not_talk_have_their_own_covariance_as_bound(build):
+@pytest.mark.parametrize(
+    "network",
+    [
+        {},
+        # of which nothing is promised to filters that talk
+        {"activation": {"kind": "periodic", "period": 0.5}},
+        {"channel": {"delay": {"kind": "exponential", "mean": 0.1}}},
+    ],
+)
+def test_filters_that_do_not_talk_have_their_own_covariance_as_bound(build, network):
+    base = {"graph": {"kind": "path", "nodes": 2}, "activation": {"kind": "poisson", "rate": 2.0}}
+    build = functools.partial(build, network={**base, **network})
     local = build(filter={"kind": "local"})
     bound = theory.covariance_bound(local, local.times)
     np.testing.assert_allclose(netkf.simulate(local).P, bound, rtol=1e-8)
