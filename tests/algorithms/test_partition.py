@@ -290,6 +290,25 @@ def test_a_reading_across_a_border_is_used_by_covariance_intersection(tmp_path: 
     assert with_flow.P[1, 1, 0, 0] == pytest.approx(min(best.fun, P), rel=1e-9)
 
 
+def test_rows_across_a_border_may_stand_among_others_in_any_order(tmp_path: Path) -> None:
+    H, R = np.array([[0.0, 0.0, 1.0, 0.0], [0.0, 1.0, -1.0, 0.0]]), np.diag([9.0, 0.05])
+    y = np.random.default_rng(3).normal(size=(12, 2)).round(3)
+
+    def run(order: list[int]) -> netkf.Run:
+        rows = [f"{t},2,{a},{b}" for t, (a, b) in enumerate(y[:, order], 1)]
+        (tmp_path / "y.csv").write_text("\n".join(["t,node,y0,y1", *rows]))
+        sensor = f'kind = "recorded"\npath = "y.csv"\nnodes = [2]\nH = {H[order].tolist()}\n'
+        sensor += f"R = {R[order][:, order].tolist()}\n"
+        # Node 1 reads too, and tells what it knows.
+        places = AREAS.rindex("[[sensors]]"), AREAS.index("[network]")
+        text = AREAS[: places[0]] + "[[sensors]]\n" + sensor + AREAS[places[1] :]
+        return netkf.simulate(load(text, tmp_path))
+
+    one, other = run([0, 1]), run([1, 0])
+    np.testing.assert_allclose(one.xhat, other.xhat, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(one.P, other.P, rtol=1e-12)
+
+
 def test_bounds_do_not_depend_on_probes(tmp_path: Path) -> None:
     text = clocked(AREAS)
     often = netkf.simulate(load(text, tmp_path, probe=0.25, horizon=4.0))
