@@ -448,8 +448,8 @@ def readings_of(
     if hasattr(path, "parts"):
         yield from path.parts(slot, x, R)
     else:
-        y, H = path.reading(slot, x), path.matrix(slot)
-        yield own_reading(path, y, H, x), H, covariance_of(path, slot, R)
+        y, H = own_reading(path, path.reading(slot, x), path.matrix(slot), x)
+        yield y, H, covariance_of(path, slot, R)[: len(y), : len(y)]
 
 
 def read_many(path: Any, numbers: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -463,21 +463,20 @@ def read_many(path: Any, numbers: Sequence[int], x: FloatArray) -> tuple[FloatAr
         pairs = [(y, path.matrix(k)) for y, k in pairs]
     else:
         pairs = [pair for pair, _ in pairs]
-    rows = [own_reading(path, y, H, state) for (y, H), state in zip(pairs, x, strict=True)]
+    rows = [own_reading(path, y, H, state)[0] for (y, H), state in zip(pairs, x, strict=True)]
     if any(len(y) != len(H) for y, (_, H) in zip(rows, pairs, strict=True)):
         rule = f"{type(path).__name__}.reading gives no values at times, which only SimPy takes"
         raise ScenarioError("sensors", rule, None, 'use engine="simpy"')
     return np.array(rows), np.array([H for _, H in pairs])
 
 
-def own_reading(path: Any, y: Any, H: Any, x: FloatArray) -> FloatArray:
-    """Return y (p,) that a ``path`` read at x (n,), with H (p, n) or a function; raises
-    ScenarioError where that of a user's class is no reading.
+def own_reading(path: Any, y: Any, H: Any, x: FloatArray) -> tuple[FloatArray, Any]:
+    """Return y (p,) that a ``path`` read at x (n,), and H (p, n) or a function: of no values no
+    rows, whatever H is. Raises ScenarioError where that of a user's class is no reading.
     """
     cls = type(getattr(path, "_path", path))
     if is_netkf_class(cls):
-        reading: FloatArray = y
-        return reading
+        return y, H
     given = np.asarray(y)
     is_right = given.dtype.kind in "fiu" and given.ndim == 1
     is_right = is_right and (callable(H) or len(given) in (0, len(H)))
@@ -485,4 +484,4 @@ def own_reading(path: Any, y: Any, H: Any, x: FloatArray) -> FloatArray:
     if not is_right or (np.isfinite(x).all() and not np.isfinite(given).all()):
         rule = f"{cls.__name__}.reading must give finite numbers, one for each row of H, or none"
         raise ScenarioError("sensors", rule, y, "correct the class")
-    return given.astype(np.float64, copy=False)
+    return given.astype(np.float64, copy=False), H if len(given) or callable(H) else H[:0]

@@ -245,3 +245,22 @@ def test_what_is_no_reading_is_refused_alike(slots, clocks, name, engine, monkey
     for scenario in (slots.replace(changes), driven, in_clocks(clocks, Odd)):
         with pytest.raises(netkf.ScenarioError, match=r"Odd.*\.reading must give finite numbers"):
             netkf.simulate(scenario, engine=engine)
+
+
+@pytest.mark.parametrize("time", ["slots", "driven", "clocks"])
+def test_a_reading_without_values_tells_as_little_as_a_row_of_zeros(
+    slots, clocks, time, monkeypatch
+):
+    changes = {"sensors": [Odd(nodes=(0, 4), **ONE)]}
+    changes |= {"plant.input": INPUT} if time == "driven" else {}
+    scenario = in_clocks(clocks, Odd) if time == "clocks" else slots.replace(changes)
+    with monkeypatch.context() as patch:
+        patch.setattr(OddInSlots, "give", staticmethod(lambda y: y[:0]))
+        run = netkf.simulate(scenario, engine="simpy")
+        with pytest.raises(netkf.ScenarioError, match="no values at times, which only SimPy"):
+            netkf.simulate(scenario, engine="compiled")
+    monkeypatch.setattr(Skewed, "matrix", lambda self, k: np.zeros((1, 4)))
+    zeros = netkf.simulate(scenario, engine="simpy")
+    np.testing.assert_allclose(run.xhat, zeros.xhat, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(run.P, zeros.P, rtol=1e-12)
+    assert run.fingerprint == zeros.fingerprint

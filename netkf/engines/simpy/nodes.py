@@ -363,7 +363,7 @@ class Node:
         """Return by what the gate multiplies R of a sample; S is H P H' + R + ``extra`` (p, p)."""
         xhat, P = self.estimate()
         y, H, R = sample
-        present = np.isfinite(y) if len(y) == len(H) else np.zeros(len(H), dtype=bool)
+        present = np.isfinite(y)
         z, J, C = (y - H @ xhat)[present], H[present], R[np.ix_(present, present)]
         assert self._gate is not None
         assert P is not None

@@ -92,9 +92,10 @@ class SamplingProcess:
             # Relative to the moving origin, like the estimates.
             x = truth.local(time)
             y, H = self.samples.reading(k, x)
-            y = own_reading(self.samples, y, H, x)
+            y, H = own_reading(self.samples, y, H, x)
             if up(self.node):
-                receiver.sample(self.node, y, H, covariance_of(self.samples, k, self.R))
+                R = covariance_of(self.samples, k, self.R)
+                receiver.sample(self.node, y, H, R[: len(y), : len(y)])
 
 
 def increment_sensors(

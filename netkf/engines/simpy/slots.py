@@ -203,9 +203,7 @@ class SlotNode(Node):
         y = np.concatenate([np.empty(0), *(y for y, *_ in samples)])
         H = np.concatenate([np.empty((0, self.width)), *(H for _, H, _ in samples)])
         R = block_diagonal([R for *_, R in samples])
-        present = np.concatenate(
-            [np.empty(0, dtype=bool), *(_finite_rows(y, H) for y, H, _ in samples)]
-        )
+        present = np.isfinite(y)
         # Rows without a value are left out of y, H and R alike.
         if not present.all():
             y, H, R = y[present], H[present], R[np.ix_(present, present)]
@@ -252,11 +250,6 @@ class SlotNode(Node):
         if not self._stopped and self._has_stopped(self.state):
             self._stopped = True
             append((now, STOP, self.node, -1, -1, phase, NAN))
-
-
-def _finite_rows(y: FloatArray, H: FloatArray) -> np.ndarray:
-    # A sensor without a reading may give an empty y.
-    return np.isfinite(y) if len(y) == len(H) else np.zeros(len(H), dtype=bool)
 
 
 class SlotClock:
