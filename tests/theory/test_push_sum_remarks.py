@@ -108,8 +108,9 @@ def test_the_transformed_noise_against_all_outcomes_of_the_links(gamma):
     [({"links": "held"}, "fresh"), ({"symmetric": False}, "together"), ({"delivery": 0.0}, "up")],
 )
 def test_where_theorem_4_does_not_hold(more, why):
-    with pytest.raises(TheoryError, match=why):
-        theory.large_gamma_limits(path(**more))
+    for function in (theory.large_gamma_limits, lambda made: theory.push_sum_noise(made, [2])):
+        with pytest.raises(TheoryError, match=why):
+            function(path(**more))
 
 
 @pytest.mark.parametrize(("case", "row"), BOUNDS, ids=lambda x: x.get("name") or str(x["p"]))
