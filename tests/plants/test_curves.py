@@ -150,6 +150,18 @@ def test_late_messages_are_predicted_by_f_with_the_input_of_their_time(folder):
                     np.testing.assert_allclose(run.xhat[k, node], m, atol=tolerance)
 
 
+@pytest.mark.parametrize("method", ["ukf", "ckf"])
+def test_sigma_points_of_a_singular_covariance_are_those_of_one_close_by(folder, method):
+    P, runs = np.array([[0.5, 0, 0.2], [0, 0, 0], [0.2, 0, 0.3]]), []
+    for rest in (0.0, 1e-13):
+        plant = table()["plant"] | {"cov": (P + rest * np.eye(3)).tolist()}
+        filtering = {"kind": "local", "linearise": method}
+        scenario = from_table(table(plant=plant, horizon=0.5, filter=filtering), folder)
+        runs.append(netkf.simulate(scenario))
+    np.testing.assert_allclose(runs[0].xhat[:, 1], runs[1].xhat[:, 1], atol=1e-9)
+    np.testing.assert_allclose(runs[0].P[:, 1], runs[1].P[:, 1], atol=1e-9)
+
+
 @pytest.mark.parametrize("method", ["ekf", "ukf", "ckf"])
 def test_a_linear_f_is_the_diffusion(folder, method):
     class Linear:
@@ -438,11 +450,21 @@ def test_both_engines_agree(folder, case, method):
         np.testing.assert_allclose(batches[0].mean_P, batches[1].mean_P, rtol=1e-9)
 
 
-def test_an_error_of_a_sensor_ends_the_run(folder):
+class Unsloped(Cubes):
+    """Readings are drawn without the Jacobian: only filters ask for it."""
+
+    def h(self, x, node):
+        return super().h(x, 0)
+
+    def jacobian(self, x, node):
+        raise ValueError("no such node")
+
+
+@pytest.mark.parametrize(("cls", "verb"), [(Cubes, "h"), (Unsloped, "jacobian")])
+def test_an_error_of_a_sensor_ends_the_run(folder, cls, verb):
     network = LATE | {"graph": {"kind": "path", "nodes": 3}}
     scenario = from_table(table(plant=SWING, network=network, sensors=[DISTANCE]), folder)
-    with pytest.raises(netkf.EngineError, match="Cubes failed in h: ValueError: no such node"):
-        netkf.simulate(
-            dataclasses.replace(scenario, sensors=(dataclasses.replace(CUBES, nodes=(2,)),)),
-            engine="compiled",
-        )
+    own = cls(nodes=(2,), R=CUBES.R, sampling=CUBES.sampling)
+    scenario = dataclasses.replace(scenario, sensors=(own,))
+    with pytest.raises(netkf.EngineError, match=f"{cls.__name__} failed in {verb}: ValueError: no"):
+        netkf.simulate(scenario, engine="compiled")
