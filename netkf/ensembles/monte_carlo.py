@@ -17,6 +17,7 @@ from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import Progress, replicate_blocks
 from netkf.ensembles.statistics import MESSAGES, RunStatistics, block_statistics, merge
 from netkf.linalg.arrays import FloatArray, from_upper
+from netkf.runs.failures import explain_failures
 from netkf.runs.simulate import choose_engine, require_scenario
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import plot_by_name
@@ -136,7 +137,9 @@ def monte_carlo(
     chosen = choose_engine(engine, scenario)
     seed, count = scenario.seed if seed is None else seed, require_runs(runs)
     task, asked = partial(block_statistics, engine=chosen), (scenario, count, seed)
-    pool, together = PoolOptions(workers, executor, scheduler), chosen.together(scenario)
+    pool = PoolOptions(workers, executor, scheduler)
+    with explain_failures(scenario):
+        together = chosen.together(scenario)
     merged = replicate_blocks(task, merge, *asked, pool=pool, progress=progress, together=together)
     return ensemble_of(scenario, merged, seed, chosen.name)
 

@@ -42,7 +42,11 @@ class Plant(Component, OnGrid):
     """
 
     _values = MappingProxyType(
-        {"n": integer(1), **dict.fromkeys(("is_random", "truth_known", "linear"), boolean)}
+        {
+            "n": integer(1),
+            **{"start_mean": vector, "start_cov": covariance},
+            **dict.fromkeys(("is_random", "truth_known", "linear"), boolean),
+        }
     )
 
     is_random: ClassVar[bool] = True

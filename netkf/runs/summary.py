@@ -16,6 +16,7 @@ import scipy
 from netkf.core.wings import WINGS
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import node_columns
+from netkf.runs.failures import explain_failures
 from netkf.runs.labels import covariance_notes
 from netkf.runs.outcomes import PairCounter, Transmissions
 from netkf.runs.quantities import NETWORK, quantity_rows, sample_names, sample_quantities
@@ -165,14 +166,15 @@ class PromisedTraces:
 
 def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
     """Return the traces of theory at the samples; none of them without the theory wing."""
-    try:
-        promised: PromisedTraces = WINGS.promise_traces(scenario, times)
-    except ModuleNotFoundError as error:
-        if not (error.name or "").startswith("netkf.theory"):
-            raise
-        reason = "not computed: netkf.theory is not installed"
-        notes = covariance_notes(scenario)
-        return PromisedTraces(None, np.nan, np.nan, reason, limit_label="", notes=notes)
+    with explain_failures(scenario):
+        try:
+            promised: PromisedTraces = WINGS.promise_traces(scenario, times)
+        except ModuleNotFoundError as error:
+            if not (error.name or "").startswith("netkf.theory"):
+                raise
+            reason = "not computed: netkf.theory is not installed"
+            notes = covariance_notes(scenario)
+            return PromisedTraces(None, np.nan, np.nan, reason, limit_label="", notes=notes)
     return promised
 
 

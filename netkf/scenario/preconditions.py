@@ -19,7 +19,7 @@ from netkf.core.errors import ScenarioError
 from netkf.core.fields import walk
 from netkf.linalg.arrays import FloatArray, is_definite
 from netkf.linalg.spectra import balance, hidden_mode, outputs_of
-from netkf.network.clocks import LinkClock
+from netkf.network.clocks import LinkClock, OnReadings
 from netkf.network.contacts import Contacts
 from netkf.network.matchings import SlotActivation
 from netkf.rng.streams import Streams
@@ -341,6 +341,10 @@ def check_activation(scenario: DerivedScenario) -> None:
     if not isinstance(clock, LinkClock) or not node_filter.timing.talks:
         return
     name = filter_name(scenario)
+    if type(clock).entities not in (LinkClock.entities, OnReadings.entities):
+        rule = f"{type(clock).__name__}.entities is never called: at says who has a clock"
+        kind = name_of("activation", clock)
+        raise ScenarioError("network.activation.kind", rule, kind, "give the others no ticks")
     if topology.directed and (clock.at == "links" or node_filter.timing.clocks == ("links",)):
         remedies = [
             f'at = "{at}"' for at in ("directions", "nodes") if at in node_filter.timing.clocks

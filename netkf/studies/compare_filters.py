@@ -216,12 +216,14 @@ def compare_filters(
                 progress(len(simulated), len(able))
     # Bonferroni: all differences from the first filter hold together.
     level = (1.0 - confidence) / (len(JUDGED) * max(1, len(simulated) - 1))
+    with explain_failures(scenario):
+        rows = tuple(_make_row(scenario, entry, simulated, level) for entry in entries)
     return FilterComparison(
         scenario=scenario.name,
         runs=count,
         seed=root,
         confidence=confidence,
-        rows=tuple(_make_row(scenario, entry, simulated, level) for entry in entries),
+        rows=rows,
         curves=tuple(one.curve for one in simulated.values() if one.curve is not None),
     )
 

@@ -29,6 +29,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.small import add_matmul, matmul
 from netkf.plants.transitions import Transitions
+from netkf.runs.failures import explain_failures
 from netkf.runs.readings import RunReadings, collect_readings
 from netkf.runs.simulate import require_scenario
 from netkf.scenario.scenario import Scenario
@@ -347,7 +348,9 @@ def log_likelihood(scenario: Scenario, seed: int | None = None, replica: int = 0
 
 def _central_model(scenario: Scenario, seed: int | None, replica: int) -> CentralModel:
     seed = scenario.seed if seed is None else integer(low=0)("seed", seed)
-    return CentralModel(scenario, seed, integer(low=0)("replica", replica))
+    replica = integer(low=0)("replica", replica)
+    with explain_failures(scenario):
+        return CentralModel(scenario, seed, replica)
 
 
 @np.errstate(under="ignore")

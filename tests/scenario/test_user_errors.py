@@ -323,6 +323,59 @@ class Rows(parts.Filter):
         return state._replace(xhat=state.xhat + np.ones(2) * (state.xhat[0] - state.xhat[0]))
 
 
+@dataclass(frozen=True, eq=False)
+class Silent(parts.Bernoulli):
+    def mean_delivery(self, sent):
+        return 1 / 0
+
+
+@dataclass(frozen=True, eq=False)
+class Stopped(parts.Poisson):
+    def ticks(self, entity, origin, index, now, random, count):
+        return 1 / 0
+
+
+@dataclass(frozen=True, eq=False)
+class Blank(parts.RangeSensor):
+    def matrix_of(self, n):
+        return 1 / 0
+
+
+def test_studies_name_the_class_that_they_call(ring):
+    lossy = ring.replace({"network.channel.loss": Silent(delivery=0.5)})
+    sensors = {"sensors[0].sampling": Stopped(rate=1.0)}
+    blank = Blank(nodes=(0,), R=[[0.5]], positions=[[1.0, 0.0]], sampling=parts.Poisson(rate=1.0))
+    for call, words in (
+        (lambda: netkf.compare_filters(lossy, ["local"], runs=2), "Silent failed in mean_delivery"),
+        (lambda: netkf.log_likelihood(ring.replace(sensors)), "Stopped failed in ticks"),
+        (lambda: netkf.fit_noise(ring.replace(sensors)), "Stopped failed in ticks"),
+        (
+            lambda: netkf.monte_carlo(ring.replace({"sensors": [blank]}), 2, workers=1),
+            "Blank failed in matrix_of",
+        ),
+    ):
+        with pytest.raises(netkf.EngineError, match=words):
+            call()
+
+
+@dataclass(frozen=True, eq=False)
+class Chosen(parts.Poisson):
+    def entities(self, topology):
+        return ((0,),)
+
+
+@dataclass(frozen=True, eq=False)
+class Startless(parts.Diffusion):
+    start_mean = None
+
+
+def test_what_no_engine_would_ask_and_values_of_plants_are_told(ring):
+    with pytest.raises(netkf.ScenarioError, match=r"Chosen\.entities is never called: at says who"):
+        ring.replace({"network.activation": Chosen(rate=1.0, at="nodes")})
+    with pytest.raises(netkf.ScenarioError, match=r"Startless\.start_mean: must be a vector"):
+        ring.replace({"plant": Startless(A=ring.plant.A, B=ring.plant.B)})
+
+
 def test_theory_names_the_class_that_it_calls(ring):
     sampling = {"kind": "periodic", "period": 0.5}
     scenario = ring.replace({"filter": Rows(), "horizon": 2.0, "sensors.0.sampling": sampling})
