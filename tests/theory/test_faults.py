@@ -59,8 +59,8 @@ def scenario_of(tmp_path):
 
 
 def of(scenario):
-    [(placed, _)] = scenario.faults[0]
-    return refusals(scenario, 0, placed)
+    [(placed, fault)] = scenario.faults[0]
+    return refusals(scenario, placed, fault, scenario.filter.gate)
 
 
 def normal_tail(mean, S):

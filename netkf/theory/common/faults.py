@@ -48,15 +48,13 @@ class _Alone(NamedTuple):
     S: FloatArray
 
 
-def refusals(scenario: Scenario, node: int, placed: PlacedSensor) -> Refusals | None:
+def refusals(scenario: Scenario, placed: PlacedSensor, fault: Fault, gate: Gate) -> Refusals | None:
     """Return how likely the gate refuses readings of a bad sensor; None if not fixed beforehand,
     as where filters believe in other matrices than the true ones.
     """
-    gate, fault = scenario.filter.gate, scenario.fault_of(node, placed)
-    sensor = scenario.sensors[placed.entry]
-    step = _step(scenario, placed)
+    sensor, step = scenario.sensors[placed.entry], _step(scenario, placed)
     is_steady = sensor.linear and not sensor.varying and scenario.filters_know_the_truth
-    if gate is None or fault is None or step is None or not is_steady:
+    if step is None or not is_steady:
         return None
     R = scenario.noise_covariance(placed.entry, believed=True)
     # The first reading of a sensor, in slots too where most filters have none in slot 0.
@@ -138,9 +136,9 @@ def fault_evidence(scenario: Scenario) -> str:
     if gate is None:
         return "; no gate refuses their readings (filter.gate)"
     told: dict[str, None] = {}
-    for node, bad in scenario.faults.items():
+    for bad in scenario.faults.values():
         for placed, fault in bad:
-            told.setdefault(_about(fault, refusals(scenario, node, placed), gate))
+            told.setdefault(_about(fault, refusals(scenario, placed, fault, gate), gate))
     return "".join(f"; {one}" for one in told)
 
 
