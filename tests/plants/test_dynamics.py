@@ -672,3 +672,54 @@ def test_a_users_sensor_is_read_alike_by_both_engines(pair, method):
     for name in ("x", "xhat", "P"):
         np.testing.assert_allclose(getattr(runs[0], name), getattr(runs[1], name), atol=1e-10)
     assert np.abs(runs[0].error[10:]).max() < 1.0
+
+
+class Climb:
+    """A motion, and below a sensor, that fails for states above 1/2, or below."""
+
+    def __init__(self, fails):
+        self.fails = fails
+
+    def f(self, x, u, t):
+        return x + 0.2 + in_range(x, self.fails)
+
+    def jacobian(self, x, u, t):
+        return np.eye(1)
+
+
+class Shown(netkf.parts.NonlinearSensor):
+    fails = None
+
+    def h(self, x, node):
+        return x + in_range(x, Shown.fails)
+
+    def jacobian(self, x, node):
+        return np.eye(1)
+
+
+def in_range(x, fails):
+    if fails is not None and (x[0] > 0.5) == (fails == "truth"):
+        raise ValueError("out of range")
+    return 0.0
+
+
+@pytest.mark.parametrize("fails", ["truth", "filter"])
+@pytest.mark.parametrize("name", ["f", "h"])
+def test_errors_at_the_truth_or_at_estimates_alone_end_the_run(name, fails, tmp_path, monkeypatch):
+    """The truth comes to be above 1/2, or is there; the estimate, which is sure, stays below."""
+    monkeypatch.setattr(Shown, "fails", fails if name == "h" else None)
+    f = Climb(fails if name == "f" else None)
+    table = {
+        "format": 1, "name": "climb", "horizon": 5.0, "probe": 1.0,
+        "plant": {
+            "kind": "nonlinear", "f": f, "period": 1.0, "Q": [[1e-12]],
+            "mean": [float(fails != "truth")], "cov": [[1e-12]],
+        },
+        "sensors": [{"nodes": [0], "H": [[1.0]], "R": [[1.0]]}],
+        "network": {"graph": {"kind": "path", "nodes": 2}, "activation": {"kind": "broadcast"}},
+        "filter": {"kind": "local", "mean": [-5.0]},
+    }  # fmt: skip
+    scenario = from_table(table, tmp_path).replace({"sensors": [Shown(nodes=(0,), R=[[1.0]])]})
+    for engine in ENGINES:
+        with pytest.raises(netkf.NetkfError, match=f"failed in {name}: ValueError: out of range"):
+            netkf.simulate(scenario, engine=engine)
