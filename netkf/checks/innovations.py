@@ -126,10 +126,10 @@ class ExpectedIncrements:
         covariance, after the estimate ``xhat`` (n,), ``P`` (n, n).
         """
         n, H = len(xhat), self._H
-        F, root = (law[0] for law in self._transitions.laws(np.array([gap])))
+        F, W = self._transitions.law(gap)
         # J is the integral of exp(A s) over the gap, so that E[z] = J xhat.
-        J, noise = F[n:, :n], root[n:]
-        S = H @ (J @ P @ J.T + noise @ noise.T) @ H.T + self._R * gap
+        J = F[n:, :n]
+        S = H @ (J @ P @ J.T + W[n:, n:]) @ H.T + self._R * gap
         return y - H @ J @ xhat, np.linalg.cholesky(S)
 
 

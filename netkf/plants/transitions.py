@@ -57,6 +57,19 @@ class Transitions:
                 Phi[k] = product(Phi[k], Phi[k])
         return Phi, L
 
+    def law(self, gap: float) -> tuple[FloatArray, FloatArray]:
+        """Return ``Phi`` and the noise covariance ``L L'``, both (n, n), of one ``gap`` in seconds,
+        in a quarter of the time of ``laws``.
+        """
+        gaps = np.array([gap])
+        doublings = self._doublings(gaps)
+        units = np.ldexp(gaps, -doublings)
+        Phi, noise = self._unit_transition(units)[0], self._unit_noise(units)[0]
+        W = noise @ noise.T
+        for _ in range(int(doublings[0])):
+            Phi, W = Phi @ Phi, W + Phi @ W @ Phi.T
+        return Phi, W
+
     def transitions(self, gaps: FloatArray) -> FloatArray:
         """Return only ``Phi = e^{A g}`` (K, n, n) of the K ``gaps`` g (K,) in seconds."""
         distinct, index = np.unique(gaps, return_inverse=True)

@@ -137,9 +137,9 @@ class ClockedInnovations:
             if time not in readings or now >= len(run.times) or blurred[last]:
                 continue
             # The node predicts over the time that passed by its clock.
-            (F,), (root,) = self._moves.laws(np.array([clock.shows(time) - clock.shows(start)]))
+            F, W = self._moves.law(clock.shows(time) - clock.shows(start))
             moved, square = (x[now] - F @ x[last])[view], np.ix_(own, own)
-            F, Q = F[view][:, view], (root @ root.T)[view][:, view]
+            F, Q = F[view][:, view], W[view][:, view]
             P = F @ run.P[last, i][square] @ F.T + Q
             if ROUNDING * abs(x[last]).max() * BLUR > np.sqrt(np.diag(P).min()):
                 continue

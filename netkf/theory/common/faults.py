@@ -120,8 +120,7 @@ def _alone(scenario: Scenario, H: FloatArray, R: FloatArray, step: float) -> _Al
         F, Q = scenario.slot_belief
     else:
         A, BB = scenario.belief
-        laws = Transitions(A, noise_root(BB)).laws(np.array([step]))
-        F, Q = laws[0][0], laws[1][0] @ laws[1][0].T
+        F, Q = Transitions(A, noise_root(BB)).law(step)
     try:
         P = steady_covariance(F, Q, H, R)
     except TheoryError:

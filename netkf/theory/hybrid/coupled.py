@@ -220,8 +220,7 @@ def coupled_riccati(scenario: Scenario) -> CoupledRiccati:
         delay = 0.0
     T, q = np.eye(n), np.zeros((n, n))
     if delay > 0.0:
-        (T,), (root,) = Transitions(A, square_root(Q)).laws(np.array([delay]))
-        q = root @ root.T
+        T, q = Transitions(A, square_root(Q)).law(delay)
     G, spread = increment_informations(scenario), scenario.initial_estimate(scenario.nodes[0])[1]
     start = np.broadcast_to(spread, G.shape).copy()
     if isinstance(scenario.filter.cov, tuple) and len(G) > 1:
