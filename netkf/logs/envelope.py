@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from scipy.special import expit, logit
+from scipy.special import betaln, expit, logit
 from scipy.stats import t as student_t
 
 from netkf.core.fields import SourceFile
@@ -29,6 +29,8 @@ from netkf.trace.run import Run
 COLUMNS = ["law", "quantity", "replay", "low", "median", "high", "p", "inside", "runs"]
 RUNS, FEW_RUNS, BUDGET = 200, 20, 180.0
 MIN_TO_GOOD = 1e-9  # a burst ends
+STRENGTHS = 2.0 ** np.arange(21)
+"""Packets that the mean of all links may count as for each of them."""
 STREAM = 0x6C617773
 """Seeds the posterior draws apart from the streams of the runs."""
 
@@ -51,8 +53,8 @@ class FittedLaw(NamedTuple):
 
     values : of NAMES; per-link: the deliveries of the L ``links``; per-link-bursts: to_bad of each
              and to_good of each; of ``rows``: K deliveries
-    counts : tries and successes of each value, (1, 2) to (2 L, 2), as independent ones: it has the
-             posterior Beta(successes + 1/2, failures + 1/2)
+    counts : tries and successes of each value, (1, 2) to (2 L, 2), as independent ones: see
+             ``_draw_alike``
     cov    : of the other laws: covariance of the values, of a chain of their logits, whose
              posterior is Gaussian
     rows   : of deliveries that change: which of the values (K,) a link has when
@@ -69,8 +71,9 @@ class FittedLaw(NamedTuple):
     def draw(self, random: np.random.Generator) -> FloatArray:
         """Return parameters drawn from their posterior."""
         if self.counts is not None:
-            count, heard = self.counts.T
-            return np.asarray(random.beta(heard + 0.5, count - heard + 0.5))
+            # to_bad and to_good of a link are no more alike than different laws.
+            alike = np.split(self.counts, 2 if self.kind == "per-link-bursts" else 1)
+            return np.concatenate([_draw_alike(counts, random) for counts in alike])
         assert self.cov is not None
         if self.kind == "gilbert-elliott":
             return expit(random.multivariate_normal(logit(self.values), self.cov))
@@ -146,6 +149,23 @@ class FittedLaw(NamedTuple):
                 scenario, dict(zip(self.links, values, strict=True))
             )
         return scenario.replace(changed)
+
+
+def _draw_alike(counts: FloatArray, random: np.random.Generator) -> FloatArray:
+    """Return probabilities (K,) drawn from their posterior, given tries and successes (K, 2)."""
+    # One by itself has Beta(successes + 1/2, failures + 1/2). Such a prior of each would move
+    # thousands of links with a few packets to one side: of several ones the mean is drawn so, and
+    # counts for each as many packets as the counts, which differ so much, make likeliest.
+    total, (count, heard) = counts.sum(axis=0), counts.T
+    mean = random.beta(total[1] + 0.5, total[0] - total[1] + 0.5)
+    if len(counts) == 1:
+        return np.array([mean])
+    center = (total[1] + 0.5) / (total[0] + 1.0)
+    a, b = STRENGTHS[:, None] * center, STRENGTHS[:, None] * (1.0 - center)
+    likelihood = (betaln(heard + a, count - heard + b) - betaln(a, b)).sum(axis=1)
+    strength = float(STRENGTHS[likelihood.argmax()])
+    lost = count - heard + strength * (1.0 - mean)
+    return np.asarray(random.beta(heard + strength * mean, lost))
 
 
 def edges_with(scenario: Scenario, deliveries: dict[tuple[str, str], float]) -> dict[str, Any]:

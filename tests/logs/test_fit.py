@@ -344,6 +344,22 @@ def test_runs_draw_parameters_from_their_posterior():
     assert values.var() == pytest.approx(a * b / (a + b) ** 2 / (a + b + 1), rel=0.1)
 
 
+@pytest.mark.parametrize(("packets", "spread"), [(2, 0.0), (10, 0.0), (10, 0.3)])
+def test_thousands_of_links_with_few_packets_are_drawn_without_a_bias(packets, spread):
+    """A prior of half a packet each moved all to one side: the true law did not make its replay."""
+    random, links = np.random.default_rng(packets), 4000
+    p = 0.65 + spread * random.uniform(-1.0, 1.0, links)
+    counts = np.stack([np.full(links, packets), random.binomial(packets, p)], axis=1).astype(float)
+    half = np.stack([counts[:, 0], counts[:, 0] - counts[:, 1]], axis=1)
+    for kind, both in (("per-link", counts), ("per-link-bursts", np.concatenate([counts, half]))):
+        drawn = np.array([FittedLaw(kind, p, 0.0, both).draw(one) for one in seeds(20, 8)])
+        for k, part in enumerate(np.split(drawn, len(both) // links, axis=1)):
+            mean, deviation = (p, 1.0 - p)[k].mean(), math.sqrt(0.23 / links / packets)
+            assert part.mean() == pytest.approx(mean, abs=4.0 * deviation)
+            # They differ as the links do, no more.
+            assert part.std(axis=1).mean() == pytest.approx(p.std(), abs=0.1 / math.sqrt(packets))
+
+
 def log_of(path, random, count=60, share=0.0):
     rows = ["t,src,dst,seq,channel,heard"]
     for k in range(count):
