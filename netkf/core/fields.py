@@ -201,13 +201,21 @@ def _check_settings(cls: type, values: Sequence[Any], named: Mapping[str, Any]) 
             raise ScenarioError(f"{cls.__name__}.{name}", "is no setting", value, remedy)
 
 
+_HOLDERS = (np.ndarray, tuple, list, dict)
+
+
 def _are_equal(a: Any, b: Any) -> bool:
     # Fast path: scenarios that are made from each other share most of their components.
     if a is b:
         return True
-    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
-        return a is not None and b is not None and np.array_equal(a, b)
-    if isinstance(a, tuple) and isinstance(b, tuple):
+    # Never by == of a user's arrays, or of what holds some.
+    if isinstance(a, _HOLDERS) or isinstance(b, _HOLDERS):
+        if type(a) is not type(b):
+            return False
+        if isinstance(a, np.ndarray):
+            return np.array_equal(a, b)
+        if isinstance(a, dict):
+            return a.keys() == b.keys() and all(_are_equal(a[key], b[key]) for key in a)
         return len(a) == len(b) and all(map(_are_equal, a, b))
     return bool(a == b)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import errno
 import hashlib
 import json
@@ -18,8 +19,9 @@ from typing import Any
 
 import numpy as np
 
+from netkf.core.contracts import is_netkf_class
 from netkf.core.errors import ScenarioError, WriteError
-from netkf.core.fields import SourceFile, as_path, walk
+from netkf.core.fields import Component, SourceFile, as_path, walk
 from netkf.plants.dynamics import CustomDynamics
 from netkf.scenario.plugins import (
     find_module_files,
@@ -29,7 +31,7 @@ from netkf.scenario.plugins import (
 )
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import source_files
-from netkf.scenario.writing import as_table, resolve_defaults, to_toml
+from netkf.scenario.writing import as_table, is_writable, resolve_defaults, to_toml
 from netkf.trace.run import Run
 
 
@@ -252,10 +254,22 @@ def check_sources(scenario: Scenario) -> None:
             rule = f"cannot name an object of {part.name} that was made with arguments"
             remedy = "give them as defaults, or derive a class that has them"
             raise ScenarioError("scenario.toml", rule, None, remedy)
+        if isinstance(part, Component) and not is_netkf_class(type(part)):
+            _check_settings(part)
     for source in source_files(scenario):
         if source.name in RUN_FILES:
             rule = "is a name that run directories use themselves"
             raise ScenarioError("path", rule, source.name, "rename the file")
+
+
+def _check_settings(part: Component) -> None:
+    for field in dataclasses.fields(part):
+        value = getattr(part, field.name)
+        left_out = value is None and field.default is None
+        if field.init and not left_out and not is_writable(value):
+            rule = f"cannot hold {type(part).__name__}.{field.name}"
+            remedy = "let it be a number, a text, an array, or lists and tables of these"
+            raise ScenarioError("scenario.toml", rule, value, remedy)
 
 
 def write_scenario(

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import datetime
 import json
+import re
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -32,6 +34,9 @@ from netkf.scenario.model import Belief, Filtering, Network
 from netkf.scenario.names import map_nodes
 from netkf.scenario.plugins import GivenName
 from netkf.scenario.registry import FAMILIES, name_of
+
+_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+_TIMES = (datetime.date, datetime.time)  # a datetime is a date
 
 
 class _Style(NamedTuple):
@@ -198,12 +203,31 @@ def _is_section(value: Any) -> bool:
 
 def toml_text(value: Any) -> str:
     """Return one value as a TOML expression on one line."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
     if isinstance(value, dict):
-        return "{ " + ", ".join(f"{k} = {toml_text(v)}" for k, v in value.items()) + " }"
-    if isinstance(value, list):
+        keys = {k: k if _BARE_KEY.fullmatch(str(k)) else _quoted(str(k)) for k in value}
+        return "{ " + ", ".join(f"{keys[k]} = {toml_text(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, (list, tuple)):
         return "[" + ", ".join(map(toml_text, value)) + "]"
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, (SourceFile, NamedNode)):
-        return json.dumps(value.name, ensure_ascii=False)
-    return json.dumps(value, ensure_ascii=False) if isinstance(value, str) else repr(value)
+        return _quoted(value.name)
+    if isinstance(value, _TIMES):
+        return value.isoformat()
+    return _quoted(value) if isinstance(value, str) else repr(value)
+
+
+def _quoted(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def is_writable(value: Any) -> bool:
+    """Return True if TOML can say a value of a user's field."""
+    if isinstance(value, dict):
+        return all(isinstance(key, str) and is_writable(item) for key, item in value.items())
+    if isinstance(value, (list, tuple)):
+        return all(map(is_writable, value))
+    simple = (bool, int, float, str, np.integer, np.floating, np.bool_, *_TIMES)
+    return isinstance(value, (*simple, np.ndarray, SourceFile, Component))

@@ -1,5 +1,6 @@
 """A scenario of a stranger executes nothing; see docs/security.md."""
 
+import dataclasses
 import importlib
 import os
 import pickle
@@ -8,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import netkf
@@ -428,6 +430,42 @@ def test_what_a_class_imports_from_its_folder_comes_along(folder, tmp_path):
     with pytest.raises(netkf.EngineError, match=r"lowest.py, which was edited since the scenario"):
         pack_scenario(first)
     assert scenario_digest(netkf.load(first_file)) != digest
+
+
+SETTINGS = """from dataclasses import dataclass, field
+from typing import Any
+
+from netkf.parts import Hybrid
+
+
+@dataclass(frozen=True, eq=False)
+class P(Hybrid):
+    given: Any = field(default=None, kw_only=True)
+"""
+GIVEN = """{ "odd key" = [1, [2.5, "x\\u007f"]], at = [07:32:00, 1979-05-27], b = { c = true } }"""
+
+
+def test_settings_of_any_form_are_written_as_they_were_given(folder, tmp_path):
+    module(folder / "evil.py", SETTINGS)
+    path = scenario(folder, horizon=1.0)
+    path.write_text(path.read_text().replace('"evil:P"', f'"evil:P"\ngiven = {GIVEN}'))
+    loaded = netkf.load(path)
+
+    def saved(algorithm, name):
+        filtering = dataclasses.replace(loaded.filter, algorithm=algorithm)
+        changed = dataclasses.replace(loaded, filter=filtering)
+        out = netkf.save(netkf.simulate(changed), changed, tmp_path / name)
+        return netkf.load(out / "scenario.toml").filter.algorithm
+
+    first = loaded.filter.algorithm
+    assert saved(first, "as given") == first
+    for name, given, back in (
+        ("number", np.float64(0.5), 0.5),
+        ("tuple", (1, np.arange(2)), [1, [0, 1]]),
+    ):
+        assert saved(dataclasses.replace(first, given=given), name).given == back
+    with pytest.raises(netkf.ScenarioError, match=r"scenario.toml: cannot hold P.given; got \{1\}"):
+        saved(dataclasses.replace(first, given={1}), "set")
 
 
 @pytest.mark.parametrize("edited", ["evil", "lowest"])
