@@ -225,6 +225,25 @@ def test_two_areas_follow_a_scalar_recursion(tmp_path: Path) -> None:
         np.testing.assert_allclose(run.P[slot, :, 0, 0], np.diag(s), rtol=1e-12)
 
 
+def test_an_area_that_is_known_exactly_is_an_input_of_the_other(tmp_path: Path) -> None:
+    """Told and known are both certain then, and S of what was told is zero."""
+    text = SCALARS
+    for old, new in (
+        ("Q = [[0.2]]", "Q = [[0.0]]"),
+        ("cov = [[0.5]]\ncoupling = [{ from = [1], A = [[-0.2]] }]", "cov = [[0.0]]"),
+        ('kind = "recorded"\npath = "y.csv"\n', ""),
+        ('channel = { loss = { kind = "recorded", path = "lost.csv" } }\n', ""),
+    ):
+        assert old in text
+        text = text.replace(old, new)
+    run, P = netkf.simulate(load(text, tmp_path)), 1.0
+    assert not run.P[:, 1].any()
+    assert not run.error[:, 1].any()
+    for slot in range(1, 10):
+        P = 1.0 / (1.0 / (0.8**2 * P + 0.1) + 1.0 / 0.1)
+        assert run.P[slot, 0, 0, 0] == pytest.approx(P, rel=1e-12)
+
+
 def test_errors_of_many_runs_are_within_the_bounds(tmp_path: Path) -> None:
     runs, level = 16, 1e-4
     scenario = load(AREAS, tmp_path, horizon=6.0)
