@@ -60,6 +60,18 @@ def test_the_slope_is_the_right_hand_side(delay):
         near(packed.unpack(packed.slope(packed.start)), plain(e, e.start, e.start))
 
 
+def test_samples_are_linearised_as_the_slope_changes():
+    random = np.random.default_rng(4)
+    H, R = random.normal(size=(2, 2, n)), np.tile(np.diag([0.5, 0.2]), (2, 1, 1))
+    heard = scipy.sparse.csr_array(random.uniform(size=(N, 2)))
+    group = PoissonSamples(np.array([0, 3]), H, R, np.array([2.0, 0.7]), heard)
+    packed = PackedRiccati(equations()._replace(samples=(group,)))
+    P, X, step = packed.pack(equations(seed=5).start), packed.pack(equations(seed=2).start), 1e-4
+    expected = (packed.slope(P + step * X) - packed.slope(P - step * X)) / (2.0 * step)
+    found = packed.linear(packed.unpack(P)).matrix(True) @ X.reshape(-1)
+    near(found, expected.reshape(-1), 1e-6)
+
+
 @pytest.mark.parametrize("arriving", [True, False])
 def test_the_linear_part_is_the_derivative_of_the_slope(arriving):
     e = equations(0.3)
