@@ -411,6 +411,11 @@ REFUSALS = {
         "sender,receiver,to_bad,to_good\n0,1,0.2,0.3\n1,0,0.2,0.4\n",
         "must give both directions of a link one to_bad and one to_good",
     ),
+    "a direction without rows": (
+        'channels = { hopping = [11], path = "s.csv" }',
+        "sender,receiver,channel,delivery\n0,1,11,0.5\n",
+        "must have a row of each direction on each channel",
+    ),
     "a channel without rows": (
         'channels = { hopping = [11, 12], path = "s.csv" }',
         "channel,delivery\n11,0.5\n",
