@@ -101,16 +101,19 @@ def test_the_grid_does_not_depend_on_what_is_shown():
         np.testing.assert_array_equal(one.state(t), other.state(t))
 
 
-def test_moments_of_the_parts_of_a_step_add_up():
-    path = plant().path(np.random.default_rng(0), np.random.default_rng(1), np.array([]))
-    path.state(0.2)
-    whole = path.moments(0.2, 0.4)
-    cuts = [0.2, 0.23, 0.31, 0.4]
+@pytest.mark.parametrize(
+    ("cut", "start", "end"), [([], 0.2, 0.4), ([0.3], 0.2, 0.3), ([0.3], 0.3, 0.4)]
+)
+def test_moments_of_the_parts_of_a_piece_add_up(cut, start, end):
+    path = plant().path(np.random.default_rng(0), np.random.default_rng(1), np.array(cut))
+    path.state(start)
+    whole, length = path.moments(start, end), end - start
+    cuts = [start, start + 0.15 * length, start + 0.55 * length, end]
     parts = [path.moments(a, b) for a, b in pairwise(cuts)]
-    np.testing.assert_allclose(sum(p[0] for p in parts), whole[0], rtol=1e-12)
+    np.testing.assert_allclose(sum(p[0] for p in parts), whole[0], rtol=1e-11)
     # P_1 of the whole on a part [a, b] is middle + share P_1 of the part
     tilted = sum(
-        (a + b - 0.6) / 0.2 * p[0] + (b - a) / 0.2 * p[1]
+        (a + b - start - end) / length * p[0] + (b - a) / length * p[1]
         for a, b, p in zip(cuts[:-1], cuts[1:], parts, strict=True)
     )
     np.testing.assert_allclose(tilted, whole[1], rtol=0, atol=1e-14)
