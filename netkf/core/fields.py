@@ -129,7 +129,8 @@ class Component:
             value, rule = getattr(self, field.name), field.metadata.get("rule")
             if rule is not None and not (value is None and field.default is None):
                 object.__setattr__(self, field.name, rule(field.name, value))
-        if self._called_if and not is_netkf_class(type(self)):
+        if not is_netkf_class(type(self)):
+            object.__setattr__(self, "_is_checked", True)
             hold_to_flags(self, self._called_if)
         if self._reads:
             getattr(self, self._reads)
@@ -149,9 +150,19 @@ class Component:
 
 def check_values(part: object) -> None:
     """Raise ScenarioError for a value that a user's class states and that breaks its rule."""
+    require_checked(part)
     rules: Mapping[str, Rule] = getattr(part, "_values", {})  # a user's dynamics are no Component
     for name, rule in rules.items():
         rule(f"{type(part).__name__}.{name}", getattr(part, name))
+
+
+def require_checked(part: object) -> None:
+    """Raise ScenarioError for a component of a user's class whose ``__post_init__`` never ran."""
+    is_own = isinstance(part, Component) and not is_netkf_class(type(part))
+    if is_own and not hasattr(part, "_is_checked"):
+        rule = f"{type(part).__name__} has settings that nobody checked"
+        remedy = "let its __init__ or __post_init__ call that of super()"
+        raise ScenarioError("", rule, None, remedy)
 
 
 def walk(value: Any) -> Iterator[Any]:
@@ -377,6 +388,7 @@ def instance_of(*classes: type) -> Rule:
     def convert(value: Any) -> Any:
         if not isinstance(value, classes):
             raise TypeError
+        require_checked(value)
         return value
 
     names = " or ".join(

@@ -19,7 +19,7 @@ import numpy as np
 
 from netkf.algorithms.registry import split_choice
 from netkf.core.contracts import is_netkf_class
-from netkf.core.fields import Component, SourceFile
+from netkf.core.fields import Component, SourceFile, require_checked
 from netkf.core.printable import NamedNode
 from netkf.network.channels import Channel
 from netkf.network.clocks import LinkClock
@@ -119,6 +119,7 @@ def _block_table(block: Block, stacked: Plant, style: _Style) -> dict[str, Any]:
 
 def part_as_table(part: Component) -> dict[str, Any]:
     """Return the table of a component, without values equal to their defaults."""
+    require_checked(part)
     return _part_table(part, _Style())
 
 

@@ -359,6 +359,31 @@ def test_studies_name_the_class_that_they_call(ring):
 
 
 @dataclass(frozen=True, eq=False)
+class WithoutInit(parts.Bernoulli):
+    def __init__(self, share):
+        object.__setattr__(self, "share", share)
+
+
+@dataclass(frozen=True, eq=False)
+class WithoutPostInit(parts.LinearSensor):
+    def __post_init__(self):
+        pass
+
+
+def test_classes_that_do_not_call_super_are_told(ring):
+    loss, sensor = WithoutInit(0.5), WithoutPostInit(nodes=[0], H=[[1.0, 0.0]], R=[[0.5]])
+    words = "has settings that nobody checked; let its __init__ or __post_init__ call that of super"
+    for change, part, check in (
+        ("network.channel.loss", loss, check_channel),
+        ("sensors", [sensor], check_sensor),
+    ):
+        with pytest.raises(netkf.ScenarioError, match=rf"{change}.*: WithoutI?P?.*{words}"):
+            ring.replace({change: part})
+        with pytest.raises(AssertionError, match=words):
+            check(part if part is loss else sensor)
+
+
+@dataclass(frozen=True, eq=False)
 class Chosen(parts.Poisson):
     def entities(self, topology):
         return ((0,),)

@@ -423,7 +423,7 @@ class Wider(LinearPlant):
         return 3
 
 
-@says(PLANTS, "Signed.start_cov: must be symmetric and positive semidefinite", **LINEAR)
+@says(PLANTS, "Signed.start_cov: must be positive semidefinite", **LINEAR)
 class Signed(LinearPlant):
     @property
     def start_cov(self):
