@@ -282,20 +282,21 @@ def transition_series(
     """
     n, count = len(A), starts.shape[1]
     A, Q, whitened_H = A.astype(WIDE), Q.astype(WIDE), whitened_H.astype(WIDE)
-    series, Q_g_G = wide_zeros(4, count, terms, n, n), wide_zeros(count, terms, n, n)
-    rows = wide_zeros(count, terms, len(whitened_H), n)
+    series = wide_zeros(4, count, terms, n, n)
+    # H F and H Q_g have q rows, often far fewer than n, or none.
+    rows, of_noise = wide_zeros(2, count, terms, len(whitened_H), n)
     series[:, :, 0] = starts
     E, F, Q_g, G = series
     # Power-series recursion: the coefficient k + 1 follows from coefficient k of the right-hand
     # side, and products of series are Cauchy products.
     for k in range(terms - 1):
-        Q_g_G[:, k] = (Q_g[:, k] @ whitened_H.T) @ whitened_H
-        rows[:, k] = whitened_H @ F[:, k]
+        rows[:, k], of_noise[:, k] = whitened_H @ F[:, k], whitened_H @ Q_g[:, k]
+        gains = np.swapaxes(of_noise, 2, 3)
         A_Q_g = A @ Q_g[:, k]
         # Q is constant: it enters the coefficient of g^0 only.
         derivative = A_Q_g + np.swapaxes(A_Q_g, 1, 2) + (Q if k == 0 else 0.0)
-        Q_g[:, k + 1] = symmetric(derivative - _convolved(Q_g_G, Q_g, k)) / (k + 1)
-        F[:, k + 1] = (A @ F[:, k] - _convolved(Q_g_G, F, k)) / (k + 1)
+        Q_g[:, k + 1] = symmetric(derivative - _convolved(gains, of_noise, k)) / (k + 1)
+        F[:, k + 1] = (A @ F[:, k] - _convolved(gains, rows, k)) / (k + 1)
         # dG/dg = F' G F = rows' rows, with rows = R^-1/2 H F.
         G[:, k + 1] = _convolved(np.swapaxes(rows, 2, 3), rows, k) / (k + 1)
         E[:, k + 1] = A @ E[:, k] / (k + 1)
