@@ -65,7 +65,7 @@ def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
     equations = coupled_riccati(scenario)
     if equations.jumps and instants[-1] > scenario.horizon:
         raise TheoryError("samples at known times are known up to the horizon")
-    if not equations.talks and not equations.samples and not equations.jumps:
+    if not equations.talks and not equations.samples:
         P = _solve_uncoupled(equations, instants)
     else:
         packed = PackedRiccati(equations)
@@ -216,8 +216,12 @@ def _covariance_scale(packed: PackedRiccati) -> float:
 
 
 def _solve_uncoupled(equations: CoupledRiccati, times: FloatArray) -> FloatArray:
-    """Return P (T, N, n, n) at ``times`` of nodes that receive nothing."""
+    """Return P (T, N, n, n) at ``times``, after the samples there, of nodes that receive nothing
+    and sample at known times if at all.
+    """
     P = np.empty((len(times), *equations.start.shape))
+    jumps = {jump.time: jump.observations for jump in equations.jumps if jump.time <= times[-1]}
+    instants = np.union1d(times, list(jumps)).tolist()
     # Nodes with equal sensors move together, and over equal gaps alike.
     groups: dict[bytes, list[int]] = {}
     for i, G in enumerate(equations.G):
@@ -225,12 +229,18 @@ def _solve_uncoupled(equations: CoupledRiccati, times: FloatArray) -> FloatArray
     for nodes in groups.values():
         flows: dict[float, RiccatiFlow] = {}
         now, present = 0.0, equations.start[nodes]
-        for k, t in enumerate(times.tolist()):
+        for t in instants:
             gap = t - now
             if gap not in flows:
                 flows[gap] = flow_covariance(equations.A, equations.Q, equations.G[nodes[0]], gap)
-            P[k, nodes] = present = move_covariances(flows[gap], present)
-            now = t
+            now, present = t, move_covariances(flows[gap], present)
+            observations = jumps.get(t, {})
+            for k, node in enumerate(nodes if observations else ()):
+                if node in observations:
+                    present[k] = joseph_update(present[k], observations[node])
+            P[np.searchsorted(times, t, "left") : np.searchsorted(times, t, "right"), nodes] = (
+                present
+            )
     return P
 
 

@@ -82,6 +82,7 @@ def has_stabilising_gains(scenario: Scenario) -> bool:
     which also finds plants with a mode that is neither driven nor damped. Raises TheoryError.
     """
     equations, _ = coupled_riccati(scenario).in_natural_units()
+    _require_no_cycle(equations)
     return _stabilising_covariances(PackedRiccati(equations), None) is not None
 
 
@@ -97,6 +98,7 @@ def steady_by_node(scenario: Scenario) -> FloatArray:
 
 def steady_state(equations: CoupledRiccati, first: FloatArray | None = None) -> FloatArray | None:
     """Return the steady state (N, n, n) of H(12), or None; TheoryError for a cycle."""
+    _require_no_cycle(equations)
     equations, units = equations.in_natural_units()
     unit = np.outer(units, units)
     packed = PackedRiccati(equations)
@@ -126,11 +128,14 @@ def steady_state(equations: CoupledRiccati, first: FloatArray | None = None) -> 
     return P * unit
 
 
+def _require_no_cycle(equations: CoupledRiccati) -> None:
+    if equations.jumps:
+        raise TheoryError("samples at known times lead to a cycle, not to a steady state")
+
+
 def _stabilising_covariances(packed: PackedRiccati, first: FloatArray | None) -> FloatArray | None:
     """Return covariances (N, n, n) whose gains stabilise H(12), or None."""
     equations = packed.equations
-    if equations.jumps:
-        raise TheoryError("samples at known times lead to a cycle, not to a steady state")
     if equations.coupling.nnz:
         # A necessary rate is cheap to compute; where the links are slower no search can succeed.
         margin = _necessary_factor(equations)
