@@ -40,6 +40,8 @@ UNKNOWN = "is not a key here"
 TABLES = ("plant", "network", "filter")
 BLOCK_KEYS = ("name", "nodes", "coupling", "position", "means")
 """Keys in one of [[plants]], beside those of its plant."""
+OF_CHANNEL = {field.name for field in dataclasses.fields(Channel)}
+"""Keys of network.channel, some of which are often written into [network]."""
 OF_BLOCKS = ("coupling", "position", "means")
 """Those of them that no other table has."""
 FILTERING_KEYS = ("mean", "cov", "model", "linearise", "estimates", "gate")
@@ -237,7 +239,9 @@ def _check_keys(
     for key, value in values.items():
         if key not in fields:
             allowed_keys = [*other_keys, *fields]
-            remedy = f"{suggest_nearest(key, allowed_keys)}keys are {', '.join(allowed_keys)}"
+            hint = "it is a key of channel; " if key in OF_CHANNEL else ""
+            hint = hint or suggest_nearest(key, allowed_keys)
+            remedy = f"{hint}keys are {', '.join(allowed_keys)}"
             if key in OF_BLOCKS:
                 remedy += f"; {key} stands in an entry of [[plants]], beside nodes"
             raise ScenarioError(key, UNKNOWN, value, remedy)

@@ -233,8 +233,8 @@ class Why:
         parts = [f"node {s.node} {self._format_time_before(s.heard)}" for s in heard[:MAX_LISTED]]
         if parts:
             more = len(heard) - MAX_LISTED
-            others = f" and {count_phrase(more, 'other')} before" if more > 0 else ""
-            yield f"It last heard {_join_with_and(parts)}{others} (times of sending)."
+            others = [f"{count_phrase(more, 'other')} before"] if more > 0 else []
+            yield f"It last heard {_join_with_and([*parts, *others])} (times of sending)."
         if silent:
             yield f"It had never heard node {list_items(silent)}."
         unheard = sum(s.unheard for s in neighbours)

@@ -165,6 +165,12 @@ TOP = [
     ("seed-fraction", {"seed": "1.5"}, "seed", "integer of at least 0; got 1.5"),
     ("seed-true", {"seed": "true"}, "seed", "integer of at least 0; got True"),
     ("seed-text", {"seed": '"one"'}, "seed", "integer of at least 0; got 'one'"),
+    (
+        "of-channel",
+        {"network.loss": '{ kind = "none" }'},
+        "network.loss",
+        "is a key of channel; keys",
+    ),
     ("unknown", {"sede": "2"}, "sede", "is not a key here; got 2"),
     ("unknown-table", {"sensor": "{ H = 1 }"}, "sensor", "is not a key here; got {'H': 1}"),
     ("unknown-lines", {r'"a\nb"': "2"}, r"a\nb", "is not a key here; got 2"),
