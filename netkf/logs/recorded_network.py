@@ -377,7 +377,9 @@ def _recorded_activation(
     if not pairing:
         return {**table, "at": needed}, _clock_rows(sends, needed, scenario.time.stamps)
     ids = {str(node): int(node) for node in scenario.nodes}
-    rows = _pairs(sends.replace({"sender": ids, "to": ids})).rename(columns={"t": "slot"})
+    for name in ("sender", "to"):  # replace would warn of its types in pandas 2
+        sends[name] = [ids.get(node, node) for node in sends[name]]
+    rows = _pairs(sends).rename(columns={"t": "slot"})
     table |= {} if pairing.phase is None else {"phase": pairing.phase}
     return table, rows.drop_duplicates().to_csv(index=False)
 

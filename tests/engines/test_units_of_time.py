@@ -161,7 +161,7 @@ def test_slots_in_every_unit(case, steps, delay, name):
     ]
     compare(*runs, unit)
     # What takes a step is in time, and what takes two is late.
-    ages = runs[1].events.groupby("kind")["age"].max()
+    ages = runs[1].events.groupby("kind", observed=True)["age"].max()
     assert ages.get("deliver", 0.0) <= unit
     assert delay < 2 or "deliver" not in ages
 

@@ -128,6 +128,7 @@ def _rough_inverse(linear: LinearisedRiccati) -> Rows:
     # m^3 operations are too many: Lyapunov equations take n^3. They leave out what samples add to
     # drifts, and what the prediction over a delay changes.
     kinds, kind = np.unique(linear.drifts.reshape(-1, n * n), axis=0, return_inverse=True)
+    kind = kind.reshape(-1)  # numpy 2.0 gives (N, 1)
     solvers = [_lyapunov_solver(F.reshape(n, n)) for F in kinds]
     arriving = sum(float(rates.sum()) for rates, _, _ in linear.heard) / len(linear.drifts)
     solve_shared = _lyapunov_solver(linear.drifts.mean(axis=0) + 0.5 * arriving * np.eye(n))
