@@ -17,7 +17,7 @@ from scipy.stats import t as student_t
 from netkf.core.fields import SourceFile
 from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import Progress, replicate
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, cached_by_entries
 from netkf.network.losses import GilbertElliott
 from netkf.network.scheduled import ScheduledLoss
 from netkf.runs.connectivity import ConnectivitySink
@@ -160,12 +160,19 @@ def _draw_alike(counts: FloatArray, random: np.random.Generator) -> FloatArray:
     mean = random.beta(total[1] + 0.5, total[0] - total[1] + 0.5)
     if len(counts) == 1:
         return np.array([mean])
-    center = (total[1] + 0.5) / (total[0] + 1.0)
-    a, b = STRENGTHS[:, None] * center, STRENGTHS[:, None] * (1.0 - center)
-    likelihood = (betaln(heard + a, count - heard + b) - betaln(a, b)).sum(axis=1)
-    strength = float(STRENGTHS[likelihood.argmax()])
+    strength = _likeliest_strength(counts)
     lost = count - heard + strength * (1.0 - mean)
     return np.asarray(random.beta(heard + strength * mean, lost))
+
+
+@cached_by_entries(maxsize=8)
+def _likeliest_strength(counts: FloatArray) -> float:
+    """Return the one of STRENGTHS under which tries and successes (K, 2) are likeliest."""
+    (count, heard), (tries, successes) = counts.T, counts.sum(axis=0)
+    center = (successes + 0.5) / (tries + 1.0)
+    a, b = STRENGTHS[:, None] * center, STRENGTHS[:, None] * (1.0 - center)
+    likelihood = (betaln(heard + a, count - heard + b) - betaln(a, b)).sum(axis=1)
+    return float(STRENGTHS[likelihood.argmax()])
 
 
 def edges_with(scenario: Scenario, deliveries: dict[tuple[str, str], float]) -> dict[str, Any]:

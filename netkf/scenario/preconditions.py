@@ -46,11 +46,8 @@ def check_preconditions(scenario: DerivedScenario) -> None:
     if needs.linear_plant and not scenario.plant.linear:
         rule = "must be a filter that uses dynamics in predictions only; "
         rule += f"the {filter_name(scenario)} computes with F"
-        kind, remedy = (
-            name_of("filter", scenario.filter.algorithm),
-            f"use a linear plant, or {ANOTHER}",
-        )
-        raise ScenarioError("filter.kind", rule, kind, remedy)
+        kind = name_of("filter", scenario.filter.algorithm)
+        raise ScenarioError("filter.kind", rule, kind, f"use a linear plant, or {ANOTHER}")
     if needs.fixed_sensors:
         _check_fixed_sensors(scenario)
     if needs.every_reading and scenario.slotted:

@@ -15,7 +15,11 @@ from netkf.runs.labels import covariance_bias
 from netkf.runs.tables import MAX_NODES, format_number, format_table
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import require_every_reading, require_linear
-from netkf.theory.common.observations import Observation, joseph_update, timed_observations
+from netkf.theory.common.observations import (
+    joseph_update,
+    stack_information,
+    timed_observations,
+)
 from netkf.theory.hybrid.limits import central_covariance
 from netkf.theory.hybrid.samples import randomly_sampled_sensors
 
@@ -69,14 +73,13 @@ def central_at_horizon(scenario: Scenario) -> FloatArray:
     central = scenario.replace({"filter": {"kind": "central"}})
     plant, P, now, piece = scenario.diffusion, scenario.plant.start_cov, 0.0, 0
     changes = plant.changes[plant.changes < scenario.horizon].tolist()
-    samples = timed_observations(central, Streams(0, 0))
+    samples = timed_observations(central, Streams(0, 0), join=stack_information)
     for time in sorted({*samples, *changes, scenario.horizon}):
-        matrices, gap = plant.pieces[piece], np.array([time - now])
-        F, root = (law[0] for law in Transitions(matrices.A, matrices.B).laws(gap))
-        P, now = F @ P @ F.T + root @ root.T, time
+        F, W = Transitions(plant.pieces[piece].A, plant.pieces[piece].B).law(time - now)
+        P, now = F @ P @ F.T + W, time
         piece += time in changes
-        for H, _, noise in samples.get(time, {}).values():
-            P = joseph_update(P, Observation(H, noise @ noise.T, noise))
+        for observation in samples.get(time, {}).values():
+            P = joseph_update(P, observation)
     return P
 
 

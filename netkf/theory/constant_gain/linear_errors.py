@@ -145,8 +145,8 @@ def _from_tick_to_tick(
         sample_noise[_node_slice(sensor.node, n), _node_slice(sensor.node, n)] += sensor.noise
     # From the last arrival to the tick, its samples, and from there to the arrival of its messages.
     transitions = Transitions(block_diagonal(list(drift)), square_root(flow_noise))
-    (to_tick, to_arrival), roots = transitions.laws(np.array([lattice.period - delay, delay]))
-    tick_noise, arrival_noise = roots @ np.swapaxes(roots, 1, 2)
+    to_tick, tick_noise = transitions.law(lattice.period - delay)
+    to_arrival, arrival_noise = transitions.law(delay)
     C = block_diagonal(list(closed))
     noise = to_arrival @ (C @ tick_noise @ C.T + sample_noise) @ to_arrival.T + arrival_noise
     transition = to_arrival @ C @ to_tick
