@@ -120,6 +120,20 @@ def test_stamps_since_1970_keep_all_digits(tmp_path, unit):
 
 
 @pytest.mark.parametrize(
+    ("unit", "text", "expected"),
+    [
+        ("s", "3", 0.505),
+        ("ms", "3", 0.001),
+        ("ms", "3.25", 1e-5),
+        ("s", "1970-01-01T00:00:03.5", 0.055),
+    ],
+)
+def test_a_stamp_and_its_origin_are_each_off_by_half_of_a_digit(unit, text, expected):
+    origin = TimeBase(unit, Decimal("1.25"))  # of hundredths, or of as many digits as the stamp
+    assert origin.half_digit(text) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize(
     "text",
     [
         "2009-07-22T15:10:04.538Z",

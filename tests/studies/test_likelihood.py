@@ -262,6 +262,9 @@ def test_the_command_prints_the_model_that_the_scenario_may_take(level, tmp_path
     lines = capsys.readouterr().out.strip().split("\n")[-2:]
     again = netkf.load(path, parse_changes(lines))
     assert log_likelihood(again) == pytest.approx(fit_noise(level).log_likelihood, abs=1e-8)
+    # Where filters believe another R than the sensor has, that is what changes.
+    told = fit_noise(level.replace({"filter.model": {"R": [[5.0]]}})).scenario
+    assert log_likelihood(told) == pytest.approx(log_likelihood(again), abs=1e-6)
     assert main(["fit", str(path), "--noise", "--json", "--set", "plant.Q=[[1.0]]"]) == 0
     got = json.loads(capsys.readouterr().out)
     assert [row["start"] for row in got["variances"]] == [1.0, 2.0]

@@ -268,6 +268,7 @@ DAMAGE = {
         "order": lambda t: t.iloc[::-1],
         "columns": lambda t: t.rename(columns={"P01": "P10"}),
         "nodes": lambda t: t.assign(node=7),
+        "times": lambda t: t.assign(t=t.t + 1e-3 * (t.index == 1)),
         "text": lambda t: t.assign(x0="1"),
     },
     "events.parquet": {

@@ -27,6 +27,7 @@ from netkf.studies.metrics import (
     central_traces,
     expected_errors_known,
     expected_metrics,
+    is_one_truth,
     join_batches,
 )
 from netkf.studies.parameter_grid import parse_grid, parse_interval, table_column
@@ -260,6 +261,15 @@ SAMPLED = {
     "probe": 1.0,
 }
 POISSON = {"kind": "poisson", "rate": 2.0}
+
+
+@pytest.mark.parametrize(
+    ("factor", "one"),
+    [(1.0, True), (1.0 + 1e-12, True), (1.0 - 1e-12, True), (1.0 + 1e-6, False), (-1.0, False)],
+)
+def test_rounding_leaves_one_truth(factor, one):
+    x = np.array([[1.0, -2.0, 0.0], [np.inf, np.nan, 3.0], [1e-300, 0.0, 0.0]])
+    assert is_one_truth(x, factor * x) == is_one_truth(factor * x, x) == one
 
 
 @pytest.mark.one_in(3)
