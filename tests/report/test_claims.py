@@ -7,6 +7,8 @@ import pytest
 import scipy.stats
 
 from netkf.report import claims
+from netkf.report.data import describe_innovations
+from netkf.trace.messages import DELIVERED, MESSAGE
 
 
 def _sentence(rows, runs):
@@ -74,3 +76,41 @@ def test_an_error_is_judged_by_the_states_that_its_node_estimates(monkeypatch):
     limit = scipy.stats.chi2.isf(claims.FALSE_ALARM / 100, 3)
     assert f"far more than its P says: NEES 30, above {limit:.4g}" in text
     assert "(the mean is then 3)" in text
+
+
+@pytest.mark.parametrize(
+    ("nis", "words"),
+    [
+        ([1.0, 1.0, 1.0], "at all 3 nodes with readings as exact covariances allow"),
+        ([1.0, 2.0, 0.3], "P is overconfident at 1 of 3 nodes with readings and conservative at 1"),
+        ([0.9, 0.3, 0.3], "P is conservative at 2 of 3"),
+        ([2.0], "2 at node 0, P is overconfident: 99% of such means would lie in {}"),
+        ([0.3], "0.3 at node 0, P is more careful than needed: 99% of such means would lie in {}"),
+        ([1.0], "1 at node 0, as exact covariances allow (99%: {})"),
+    ],
+)
+def test_mean_innovations_are_judged_by_chi_square(nis, words):
+    nodes = np.repeat(np.arange(len(nis)), 50)
+    topology = SimpleNamespace(named=lambda node: node)
+    nis, rows = np.repeat(2.0 * np.array(nis), 50), np.full(len(nodes), 2)
+    readings = SimpleNamespace(nis=nis, nodes=nodes, rows=rows, increments=0)
+    text = describe_innovations(readings, SimpleNamespace(topology=topology))
+    low, high = scipy.stats.chi2(100).ppf([0.005, 0.995]) / 100
+    assert words.format(f"{low:.4g} .. {high:.4g}") in text
+
+
+@pytest.mark.parametrize(
+    ("at", "words"),
+    [
+        (20, "unusually old: 10 s on average over its links, older than at 95% of its samples"),
+        (6, "not unusual: 1 s on average over its links, mean over the run 3.25 s"),
+    ],
+)
+def test_information_is_old_among_that_of_the_run(at, words):
+    """Messages of 1, ..., 10 s arrive half a second later: ages are 1 s up to 11 s, then 2, ..."""
+    heard = np.zeros(10, dtype=MESSAGE)
+    heard["sent"], heard["outcome"] = np.arange(1, 11), DELIVERED
+    heard["ended"], heard["receiver"] = heard["sent"] + 0.5, 1
+    source, run = SimpleNamespace(cutoffs=lambda t: t), SimpleNamespace(times=np.arange(21.0))
+    text = claims._judge_age(source, run, heard, SimpleNamespace(node=1, time=float(at)))
+    assert words in text
