@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.optimize
+import scipy.special
 import scipy.stats
 
 import netkf
@@ -268,15 +269,29 @@ def test_the_chain_of_two_states():
     assert np.mean(np.square(off)) < 2.0  # a mean of 24 squares of standard normals, nearly
     assert np.abs(off).max() < 4.0
     # The likelihood, written plainly for one link: the forward algorithm.
-    outcomes = drawn(np.random.default_rng(1), T=40, chain=true, senders=1, hearers=1)
+    outcomes = drawn(np.random.default_rng(1), T=300, chain=true, senders=1, hearers=1)
     chain = fit_chain(outcomes)
-    to_bad, to_good, good, bad = chain.values
-    move = np.array([[1 - to_bad, to_bad], [to_good, 1 - to_good]])
-    law, total = np.array([to_good, to_bad]) / (to_bad + to_good), 0.0
-    for x in outcomes.groups[0].x[:, 0]:
-        law = law @ move * (np.array([good, bad]) if x else 1.0 - np.array([good, bad]))
-        total, law = total + math.log(law.sum()), law / law.sum()
-    assert chain.likelihood == pytest.approx(total, abs=1e-9)
+
+    def likelihood(logits):
+        to_bad, to_good, good, bad = scipy.special.expit(logits)
+        move = np.array([[1 - to_bad, to_bad], [to_good, 1 - to_good]])
+        law, total = np.array([to_good, to_bad]) / (to_bad + to_good), 0.0
+        for x in outcomes.groups[0].x[:, 0]:
+            law = law @ move * (np.array([good, bad]) if x else 1.0 - np.array([good, bad]))
+            total, law = total + math.log(law.sum()), law / law.sum()
+        return total
+
+    best, step = scipy.special.logit(chain.values), 0.01 * np.eye(4)
+    assert chain.likelihood == pytest.approx(likelihood(best), abs=1e-9)
+    # The covariance is that of its curvature and of a prior of deviation 2.
+    curvature = [
+        [
+            sum(s * r * likelihood(best + s * a + r * b) for s in (1, -1) for r in (1, -1)) / -4e-4
+            for a in step
+        ]
+        for b in step
+    ]
+    np.testing.assert_allclose(np.linalg.inv(chain.cov), curvature + 0.25 * np.eye(4), atol=0.2)
 
 
 def test_the_spread_of_deliveries_that_is_noise_is_that_of_what_hearers_lose_alone():
