@@ -40,6 +40,7 @@ DELAY, SAMPLING = "network.channel.delay.seconds", "sensors.0.sampling.period"
 def path(tmp_path):
     file = tmp_path / "grid.toml"
     file.write_text(TEXT)
+    (tmp_path / "ticks.csv").write_text(f"t,node\n0.5,0\n{1 / 3},1\n{2 / 7},2\n")
     return file
 
 
@@ -58,6 +59,10 @@ def path(tmp_path):
         ({"network.channel.delay.seconds": 1 / 600}, TimeGrid(1e-13, 3)),
         ({"sensors.0.sampling.period": 1 / 3}, TimeGrid(1e-13, 3)),
         ({"sensors.0.sampling.period": 0.1 + 0.2}, TimeGrid(1e-13)),
+        (
+            {"network.activation": {"kind": "recorded", "path": "ticks.csv", "at": "nodes"}},
+            TimeGrid(1e-12, 21),
+        ),
         ({"time.resolution": 1e-3}, TimeGrid(1e-3)),
         ({"time.refine": 12}, TimeGrid(1e-12, 12)),
         ({"horizon": 1e-9, "probe": 1e-9, "network.channel.delay.seconds": 0.0}, None),

@@ -602,6 +602,13 @@ def test_theory_that_does_not_tell_is_refused_or_replaced(short):
     wrong = short.replace({"filter.model": {"R": [[0.5]]}})
     with pytest.raises(TheoryError, match="model differs"):
         size(wrong, RATE, 0.5, 5.0, "worst_rms<=3.0", by="theory")
+    # P is that of the model, whatever is true.
+    believed = short.replace({"sensors.0.R": [[0.5]]})
+    told, expected = (
+        size(one, RATE, 0.5, 5.0, "mean_trace<=3.0", by="theory").probes
+        for one in (wrong, believed)
+    )
+    assert [p.quantity for p in told] == pytest.approx([p.quantity for p in expected], rel=1e-9)
     sure = short.replace({"filter.cov": [[0.1, 0.0], [0.0, 0.1]]})
     with pytest.raises(TheoryError, match="below the covariance of the first error"):
         size(sure, RATE, 0.5, 5.0, "worst_rms<=3.0", by="theory")
