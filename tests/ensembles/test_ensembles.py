@@ -369,6 +369,8 @@ def test_a_directory_of_many_runs(tmp_path, short, capsys):
     after = states[states.t > 0.0]
     assert summary["overall"]["rms_error"] == pytest.approx(np.sqrt(after.sq_error.mean()))
     assert summary["overall"]["mean_trace"] == pytest.approx((after.P00 + after.P11).mean())
+    bound = np.trace(netkf.theory.covariance_bound(short, short.times)[1:], axis1=2, axis2=3)
+    assert summary["overall"]["bound"] == pytest.approx(bound.mean())
     assert summary["messages"]["sent"] == pytest.approx((events.kind == "send").sum() / 5)
     assert not (full / "blocks").exists()
 

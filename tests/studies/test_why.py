@@ -432,6 +432,11 @@ def test_what_cannot_be_answered_is_refused_in_one_line(runs):
         why(replace(run, log=run.log[:0]), 1, 3.0)
     with pytest.raises(ScenarioError, match="other events than its replay"):
         why(replace(run, seed=4), 1, 3.0)
+    for name in ("t", "peer", "message"):  # one number of one event
+        other = run.log.copy()
+        other[name][0] += 1
+        with pytest.raises(ScenarioError, match="other events than its replay"):
+            why(replace(run, log=other), 1, 3.0)
     with pytest.raises(ScenarioError, match="scenario: is not known"):
         why(replace(run, scenario=None), 1, 3.0)
     cut = replace(run, status="interrupted", times=run.times[:3])
