@@ -918,6 +918,7 @@ def test_a_run_directory_is_exported(tmp_path, capsys):
     arguments = ["run", str(scenario), "--no-plot", "--set", "horizon=1.0", "--engine", "simpy"]
     assert main([*arguments, "--out", str(tmp_path / "run")]) == 0
     export = ["export", str(tmp_path / "run"), "--to", "log", "--out", str(tmp_path / "log")]
+    (tmp_path / "log").mkdir()
     assert main(export) == 0
     assert {p.name for p in (tmp_path / "log").iterdir()} == {
         *("packets.csv", "ticks.csv", "scenario.toml"),
