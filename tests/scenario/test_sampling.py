@@ -88,6 +88,7 @@ def test_models_hold_the_sensors_of_increments_only(make):
     assert mixed.diffusion.sensing_period == make([INCREMENTS]).diffusion.sensing_period
     assert make().diffusion.sensing_period is None
     assert make([]).diffusion.sensing_period is not None
+    assert make([INCREMENTS], {"sensing_period": 0.015625}).diffusion.sensing_period == 0.015625
 
 
 def test_the_default_sensing_period_suits_each_node_and_not_only_all_together(make):
