@@ -86,6 +86,11 @@ def test_a_bias_is_that_of_weighted_least_squares(walk):
     assert row.bias_reach == pytest.approx(scipy.stats.norm.isf(0.01 / 2.0) * error)
     *_, reach, _, _ = _bias(recorded, np.arange(120), np.zeros(120, dtype=int), 4.0, 0.01)
     assert reach == pytest.approx(scipy.stats.t.isf(0.01 / 2.0, 120 / 4.0 - 1.0) * 2.0 * error)
+    # Of two components the one that is further from 0, by Bonferroni's inequality.
+    *_, reach, _, which = _bias(recorded, np.arange(120), np.arange(120) % 2, 1.0, 0.01)
+    sums, weights = ((d**-2.0 * x).reshape(60, 2).sum(axis=0) for x in (v, 1.0))
+    assert which == np.argmax(np.abs(sums) / np.sqrt(weights))
+    assert reach == pytest.approx(scipy.stats.norm.isf(0.01 / 4.0) * weights[which] ** -0.5)
 
 
 def broken(tests):
