@@ -94,6 +94,7 @@ def test_auto_takes_simpy_with_a_note_and_compiled_is_refused_in_one_line(tmp_pa
     *notes, refusal = done.stderr.strip().splitlines()
     assert any("numba is not installed: runs in" in note for note in notes)
     assert 'engine "compiled" needs numba' in refusal
+    assert "install it (pip install numba)" in refusal
     assert 'engine "compiled"' not in "".join(notes)
     assert not (tmp_path / "compiled").exists()
     assert json.loads((tmp_path / "auto" / "manifest.json").read_text())["engine"] == "simpy"

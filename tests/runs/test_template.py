@@ -34,6 +34,13 @@ def test_the_scenario_loads_and_its_tests_pass(written):
     tests.test_no_promise_is_broken(4.0, 1.0)
 
 
+def test_nothing_refers_to_files_that_only_the_repository_has(written):
+    # Whoever has the installed package has no docs/, scenarios/ or tests/ beside it.
+    files = [written / "my-ring.toml", written / "test_my_ring.py"]
+    text = "".join(path.read_text() for path in files)
+    assert not [name for name in ("docs/", "scenarios/", "tests/") if name in text]
+
+
 def test_the_tests_can_fail(written, monkeypatch):
     bound = netkf.theory.covariance_bound
     monkeypatch.setattr(netkf.theory, "covariance_bound", lambda *asked: 0.6 * bound(*asked))

@@ -52,7 +52,8 @@ class CompiledEngine(Engine):
         """Return why this engine cannot run the scenario, with the remedy; None if it can."""
         remedy = 'use engine="simpy", or "auto", which chooses'
         if not has_numba():
-            return f'engine "compiled" needs numba, which is not installed; {remedy}'
+            absent = 'engine "compiled" needs numba, which is not installed'
+            return f"{absent}; install it (pip install numba), or {remedy}"
         if scenario.views is not None and (rule := blocks_refusal(scenario)) is not None:
             return f'engine "compiled" cannot run {rule}; {remedy}'
         # ``type`` and not ``isinstance``: kernels do not know what a derived class changes.
