@@ -14,7 +14,7 @@ of a double integrator in other coordinates by 1e-8.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -93,14 +93,22 @@ def hidden_mode(A: FloatArray, C: FloatArray, border: Border | None = None) -> c
 
     Neither units of states that A couples nor those of all outputs together matter.
     """
-    balanced, scale = balance(A)
-    values = eigenvalues(A).tolist() if border is None else _remaining_eigenvalues(A, border)
-    for value in values:
+    # States that drive no output, also by way of others: all their modes are hidden.
+    silent = ~_reachable(A.T)[:, (C != 0.0).any(axis=0)].any(axis=1)
+    hidden = next(_eigenvalues_to_see(A[np.ix_(silent, silent)], border), None)
+    if hidden is None:
+        balanced, scale = balance(A)
         # In the given units too: where A is nearly triangular, as [[1e-12, 1], [0, 1]] is, balanced
         # ones make the entries vanish that couple its blocks.
-        if _hides(balanced, C * scale, value) and _hides(A, C, value):
-            return value if value.imag else value.real + 0.0  # -0.0 is 0
-    return None
+        hidden = next(
+            (
+                value
+                for value in dict.fromkeys(_eigenvalues_to_see(A, border))
+                if _hides(balanced, C * scale, value) and _hides(A, C, value)
+            ),
+            None,
+        )
+    return hidden if hidden is None or hidden.imag else hidden.real + 0.0  # -0.0 is 0
 
 
 def _hides(A: FloatArray, C: FloatArray, value: complex) -> bool:
@@ -136,15 +144,16 @@ def _largest(A: FloatArray, border: Border) -> float:
     return largest
 
 
-def _remaining_eigenvalues(A: FloatArray, border: Border) -> list[complex]:
-    """Return the eigenvalues of A (n, n) whose modes do not decay, but for rounding."""
-    remaining = []
+def _eigenvalues_to_see(A: FloatArray, border: Border | None) -> Iterator[complex]:
+    """Yield the eigenvalues of A (n, n), with a border those whose modes do not decay."""
     for block in _irreducible_blocks(A):
         for value in _block_eigenvalues(block).tolist():
-            grows = border.measure(value) > border.limit
-            if grows or _joined(block, value, border.nearest(value)):
-                remaining.append(value)
-    return remaining
+            if (
+                border is None
+                or border.measure(value) > border.limit
+                or _joined(block, value, border.nearest(value))
+            ):
+                yield value
 
 
 def balanced_norm(A: FloatArray) -> float:
@@ -154,16 +163,22 @@ def balanced_norm(A: FloatArray) -> float:
     return max((float(np.abs(b).sum(axis=0).max()) for b in _irreducible_blocks(A)), default=0.0)
 
 
-def _irreducible_blocks(A: FloatArray) -> list[FloatArray]:
-    """Return the balanced diagonal blocks of A (n, n) in block triangular form."""
-    n = len(A)
-    reaches = (A != 0.0) | np.eye(n, dtype=bool)
-    for _ in range(n.bit_length()):
-        reaches = reaches @ reaches
-    mutual = reaches & reaches.T
-    first = np.argmax(mutual, axis=1) if n else np.zeros(0, dtype=int)
-    groups = (np.flatnonzero(first == k) for k in np.unique(first))
-    return [balance(A[np.ix_(group, group)])[0] for group in groups]
+def _irreducible_blocks(A: FloatArray) -> Iterator[FloatArray]:
+    """Yield the balanced diagonal blocks of A (n, n) in block triangular form."""
+    reaches = _reachable(A)
+    first = np.argmax(reaches & reaches.T, axis=1) if len(A) else np.zeros(0, dtype=int)
+    for k in np.unique(first):
+        group = np.flatnonzero(first == k)
+        yield balance(A[np.ix_(group, group)])[0]
+
+
+def _reachable(A: FloatArray) -> np.ndarray:
+    """Return a mask (n, n): whether a path of entries of A other than 0 leads from i to j."""
+    reaches, before = (A != 0.0) | np.eye(len(A), dtype=bool), 0
+    while before < (before := np.count_nonzero(reaches)):
+        # Products of numbers are far quicker than those of truth values, and exact here.
+        reaches = reaches.astype(np.float32) @ reaches.astype(np.float32) > 0.0
+    return reaches
 
 
 def _block_eigenvalues(A: FloatArray) -> ComplexArray:

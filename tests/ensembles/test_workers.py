@@ -53,7 +53,7 @@ def test_workers_are_killed_at_once(ring, tmp_path):
     began = time.monotonic()
 
     def interrupt():
-        while len(list(tmp_path.iterdir())) < 2 and time.monotonic() - began < 5.0:
+        while len(list(tmp_path.iterdir())) < 2 and time.monotonic() - began < 30.0:
             time.sleep(0.01)
         os.kill(os.getpid(), signal.SIGINT)
 
@@ -61,7 +61,7 @@ def test_workers_are_killed_at_once(ring, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         replicate(sleeps, ring.replace({"claim": str(tmp_path)}), 2, pool=PoolOptions(2))
     assert len(list(tmp_path.iterdir())) == 2
-    assert time.monotonic() - began < 10.0
+    assert time.monotonic() - began < 50.0
 
 
 class TwoArgumentsError(Exception):

@@ -114,6 +114,25 @@ def test_sensors_of_very_different_precision_show_modes_alike():
         assert hidden_mode(np.zeros((3, 3)), outputs_of(H.T @ H / 1e-6)) is not None
 
 
+def test_modes_of_many_states_that_others_drive_are_those_of_the_rank_of_observability():
+    random = np.random.default_rng(7)
+    verdicts = []
+    for _ in range(300):
+        n, k = random.integers(1, 6), random.integers(1, 3)
+        # Blocks that are equal, apart, or drive each other, of small integers: ranks are exact.
+        A = (random.integers(-2, 3, (n, n)) * (random.random((n, n)) < 0.35)).astype(float)
+        C = (random.integers(-1, 2, (k, n)) * (random.random((k, n)) < 0.5)).astype(float)
+        powers = [np.linalg.matrix_power(A, i) for i in range(n)]
+        seen = np.linalg.matrix_rank(np.concatenate([C @ power for power in powers]))
+        verdicts.append(seen < n)
+        hidden = hidden_mode(A, C)
+        assert (hidden is not None) == verdicts[-1]
+        if hidden is not None:
+            pencil = np.concatenate([A - hidden * np.eye(n), C])
+            assert np.linalg.svd(pencil, compute_uv=False)[-1] < 1e-7
+    assert 50 < sum(verdicts) < 250
+
+
 def test_definite_matrices_are_told_from_singular_ones():
     random = np.random.default_rng(6)
     for n in range(2, 7):

@@ -4,6 +4,7 @@
 """
 
 import contextlib
+import functools
 import os
 import resource
 import subprocess
@@ -19,7 +20,15 @@ from netkf.scenario.reading import parse_toml
 from tests.conftest import SCENARIOS
 from tests.scenario import malformed
 
-SECONDS, MEMORY = 2.0, 1 << 30
+MEMORY = 1 << 30
+
+
+@functools.cache
+def seconds():
+    """Return how long the reader of TOML needs for 10^6 numbers: of a machine, and as it is now."""
+    began = time.process_time()
+    tomllib.loads("a = [" + "1," * 10**5 + "]")
+    return 10.0 * (time.process_time() - began)
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +55,7 @@ def test_drawn_cases_are_refused_in_one_line_or_are_scenarios(folder, first):
                 assert line.isprintable(), seed
                 assert len(line) < 2500, seed
                 raise
-        assert time.process_time() - began < 2.0 * SECONDS, seed
+        assert time.process_time() - began < 4.0 * seconds(), seed
     assert not (folder / "ran").exists()
 
 
@@ -103,7 +112,7 @@ def test_sizes_are_answered_before_they_hurt(file, changes, key, words):
     assert refused.value.key.startswith(key)
     assert words in str(refused.value)
     assert len(str(refused.value)) < 1000
-    assert time.process_time() - began < SECONDS
+    assert time.process_time() - began < 2.0 * seconds()
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < MEMORY >> 10
 
 
@@ -112,7 +121,7 @@ def test_a_graph_that_is_never_connected_is_given_up_soon():
     graph = {"kind": "geometric", "nodes": 20_000, "radius": 0.001, "connected": True}
     with pytest.raises(netkf.ScenarioError, match=r"none of \d+ graphs"):
         netkf.load(SCENARIOS / RING, {"network.graph": graph})
-    assert time.process_time() - began < 3.0 * SECONDS
+    assert time.process_time() - began < 6.0 * seconds()
 
 
 @pytest.mark.one_in(3)
@@ -125,7 +134,7 @@ def test_documents_that_are_hard_to_read_are_refused_soon(tmp_path, number):
         netkf.load(file)
     assert str(refused.value).isprintable()
     assert len(str(refused.value)) < 1000
-    assert time.process_time() - began < SECONDS
+    assert time.process_time() - began < 2.0 * seconds()
 
 
 def test_a_device_that_never_ends_is_no_scenario(tmp_path):
