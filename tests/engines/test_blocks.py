@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import netkf
+from netkf.engines.compiled import slot_pairs
 from netkf.engines.compiled.slot_setup import slot_setup
 from tests.algorithms.test_block_intersection import CLOCKED, ROBOTS, load
 from tests.algorithms.test_partition import AREAS, FLOWS
@@ -253,3 +254,20 @@ def test_many_robots_are_few_states_each(tmp_path):
     assert (scenario.width, len(infos)) == (1, 600)
     # Some matrices of all states, whatever the number of nodes.
     assert peak < 200e6
+
+
+def test_what_the_compiled_engine_runs_is_asked_once_for_all_runs_of_a_scenario(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``why`` replays a run hundreds of times: of 150 robots two thirds of it went there."""
+    asked = []
+    ask = slot_pairs._reads_in_its_own_way
+    monkeypatch.setattr(
+        slot_pairs, "_reads_in_its_own_way", lambda *args: asked.append(args) or ask(*args)
+    )
+    scenario = load(POSES, tmp_path)
+    first = netkf.simulate(scenario)
+    count = len(asked)
+    assert count > 0
+    assert netkf.simulate(scenario).fingerprint == first.fingerprint
+    assert len(asked) == count

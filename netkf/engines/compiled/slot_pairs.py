@@ -14,6 +14,7 @@ from netkf.algorithms.translation import read_vector
 from netkf.core.places import Place
 from netkf.engines.compiled.nonlinear_rows import NonlinearSetup, has_known_h
 from netkf.engines.compiled.own_sensors import reads_as_built_in
+from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.scenario.model import PlacedSensor
 from netkf.scenario.scenario import Scenario
@@ -143,6 +144,7 @@ def matrix_of(sensor: Any, anchor: int, n: int) -> FloatArray:
     return np.asarray(matrices[anchor] if anchor in matrices else sensor.matrix_of(n))
 
 
+@once_per_scenario
 def blocks_refusal(scenario: Scenario) -> str | None:
     """Return what the compiled engine cannot do where nodes estimate different states."""
     if scenario.common_entries and scenario.node_filter.timing.talks:
