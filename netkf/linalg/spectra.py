@@ -175,10 +175,10 @@ def _irreducible_blocks(A: FloatArray) -> Iterator[FloatArray]:
 def _reachable(A: FloatArray) -> np.ndarray:
     """Return a mask (n, n): whether a path of entries of A other than 0 leads from i to j."""
     reaches, before = (A != 0.0) | np.eye(len(A), dtype=bool), 0
-    while before < (before := np.count_nonzero(reaches)):
+    while before < (before := int(np.count_nonzero(reaches))):
         # Products of numbers are far quicker than those of truth values, and exact here.
         reaches = reaches.astype(np.float32) @ reaches.astype(np.float32) > 0.0
-    return reaches
+    return np.asarray(reaches)
 
 
 def _block_eigenvalues(A: FloatArray) -> ComplexArray:
