@@ -62,7 +62,7 @@ def eigenvalues(A: FloatArray) -> ComplexArray:
     Those that only rounding tells apart are replaced by their mean, which is accurate where they
     are not, and those that only rounding tells from 0 by 0.
     """
-    return np.concatenate([np.zeros(0), *map(_block_eigenvalues, _irreducible_blocks(A))])
+    return np.fromiter(_eigenvalues_to_see(A), dtype=np.complex128)
 
 
 def growth_rate(A: FloatArray) -> float:
@@ -94,7 +94,7 @@ def hidden_mode(A: FloatArray, C: FloatArray, border: Border | None = None) -> c
     Neither units of states that A couples nor those of all outputs together matter.
     """
     # States that drive no output, also by way of others: all their modes are hidden.
-    silent = ~_reachable(A.T)[:, (C != 0.0).any(axis=0)].any(axis=1)
+    silent = ~_reachable(A)[(C != 0.0).any(axis=0)].any(axis=0)
     hidden = next(_eigenvalues_to_see(A[np.ix_(silent, silent)], border), None)
     if hidden is None:
         balanced, scale = balance(A)
@@ -144,7 +144,7 @@ def _largest(A: FloatArray, border: Border) -> float:
     return largest
 
 
-def _eigenvalues_to_see(A: FloatArray, border: Border | None) -> Iterator[complex]:
+def _eigenvalues_to_see(A: FloatArray, border: Border | None = None) -> Iterator[complex]:
     """Yield the eigenvalues of A (n, n), with a border those whose modes do not decay."""
     for block in _irreducible_blocks(A):
         for value in _block_eigenvalues(block).tolist():
@@ -175,9 +175,10 @@ def _irreducible_blocks(A: FloatArray) -> Iterator[FloatArray]:
 def _reachable(A: FloatArray) -> np.ndarray:
     """Return a mask (n, n): whether a path of entries of A other than 0 leads from i to j."""
     reaches, before = (A != 0.0) | np.eye(len(A), dtype=bool), 0
-    while before < (before := int(np.count_nonzero(reaches))):
+    while (count := np.count_nonzero(reaches)) > before:
         # Products of numbers are far quicker than those of truth values, and exact here.
         reaches = reaches.astype(np.float32) @ reaches.astype(np.float32) > 0.0
+        before = int(count)
     return np.asarray(reaches)
 
 

@@ -15,8 +15,8 @@ SCENARIO = """\
 # netkf run {name}.toml                  simulates it
 # netkf theory {name}.toml               computes what theory promises
 # netkf check {name}.toml --runs 200     compares the two
-# netkf schema --markdown             prints every key
-# For an editor: netkf schema > netkf.schema.json, and as first line #:schema ./netkf.schema.json
+# Every key is in `netkf schema --markdown`. For an editor: netkf schema > netkf.schema.json, and as
+# first line #:schema ./netkf.schema.json
 format  = 1
 name    = "{name}"
 claim   = "the covariances stay below the coupled Riccati bound in the mean"

@@ -50,18 +50,19 @@ def sleeps(scenario, seed, replica):
 
 
 def test_workers_are_killed_at_once(ring, tmp_path):
-    began = time.monotonic()
+    began, killed = time.monotonic(), []
 
     def interrupt():
         while len(list(tmp_path.iterdir())) < 2 and time.monotonic() - began < 30.0:
             time.sleep(0.01)
+        killed.append(time.monotonic())
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=interrupt).start()
     with pytest.raises(KeyboardInterrupt):
         replicate(sleeps, ring.replace({"claim": str(tmp_path)}), 2, pool=PoolOptions(2))
     assert len(list(tmp_path.iterdir())) == 2
-    assert time.monotonic() - began < 50.0
+    assert time.monotonic() - killed[0] < 10.0
 
 
 class TwoArgumentsError(Exception):

@@ -25,7 +25,7 @@ MEMORY = 1 << 30
 
 @functools.cache
 def seconds():
-    """Return how long the reader of TOML needs for 10^6 numbers: of a machine, and as it is now."""
+    """Return how long the reader of TOML needs for 10^6 numbers: here and now."""
     began = time.process_time()
     tomllib.loads("a = [" + "1," * 10**5 + "]")
     return 10.0 * (time.process_time() - began)
